@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Collection
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -43,6 +43,14 @@ class Value:
     reason: str = ""
     failed: bool = False
     extremes: tuple[tuple[float, float], tuple[float, float]] | None = None
+
+
+class Samples(NamedTuple):
+    """Samples along the tunnel, of which a metric's decorator names the statistic."""
+
+    values: Float[np.ndarray, " n"]  # one number each
+    station: Float[np.ndarray, " n"]  # m
+    most: int = 200_000  # largest number of samples for the interval; the value itself uses all
 
 
 def number(value: float, n: int = 0, reason: str = "") -> Value:
@@ -93,14 +101,9 @@ def estimate(
     rng: np.random.Generator,
     most: int = 200_000,
 ) -> Value:
-    """Return a statistic of samples along the tunnel with its block-bootstrap interval.
+    """Return a statistic of samples along the tunnel, see `Samples`, with its interval by bootstrap of blocks.
 
-    Args:
-        statistic: Function of any subset of the samples.
-        samples: One number each, `(n,)`.
-        station: Station of each sample, m, `(n,)`; blocks are `BLOCK` long.
-        rng: Random numbers that draw the blocks.
-        most: Largest number of samples for the interval; the value itself uses all.
+    Blocks are `BLOCK` long, and `rng` draws them.
     """
     keep = np.isfinite(samples)
     samples, station = samples[keep], station[keep]
@@ -141,6 +144,8 @@ def compute_metric(case: Case, row: Metric) -> Value:
         return missing(_ABSENT[row.needs])
     try:
         found = row.compute(case)
+        if isinstance(found, Samples) and row.of is not None:
+            return estimate(row.of, found.values, found.station, case.rng(row.id), found.most)
         return found if isinstance(found, Value) else number(float(found))
     except ImportError as error:
         return missing(f"{error.name} is not installed")

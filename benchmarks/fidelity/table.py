@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -104,7 +103,8 @@ class Metric:
         map: Map to a score.
         evidence: Letters of H held-out, T truth, K standard, S self-consistency, C true by construction.
         needs: Reference that it cannot do without.
-        compute: Function from a case to a value.
+        compute: Function from a case to a value, or to samples.
+        of: Statistic of the samples.
     """
 
     number: int
@@ -117,6 +117,7 @@ class Metric:
     evidence: str
     needs: Need | None
     compute: Callable[[Any], Any] = field(compare=False, repr=False)
+    of: Callable[[Any], float] | None = field(default=None, compare=False, repr=False)
 
     @property
     def scored(self) -> bool:
@@ -130,7 +131,8 @@ class Metric:
 
     def as_row(self) -> dict[str, Any]:
         """Return everything that a verdict depends on, as plain data."""
-        return {key: value for key, value in asdict(replace(self, compute=str)).items() if key != "compute"}
+        plain = asdict(replace(self, compute=str, of=None))
+        return {key: value for key, value in plain.items() if key not in ("compute", "of")}
 
 
 _METRICS: dict[str, Metric] = {}
@@ -146,7 +148,8 @@ def metric(
     gate: bool = False,
     needs: Need | None = None,
     evidence: str | None = None,
-    args: tuple[Any, ...] | None = None,
+    of: Callable[[Any], float] | None = None,
+    args: tuple[Any, ...] = (),
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Registers the function that computes a metric from a case; several on one function register as many metrics.
 
@@ -158,7 +161,8 @@ def metric(
         gate: A score below 50 caps the category.
         needs: `hold` a held-out recording; `truth` the generator's truth or unseen control; `reference` either.
         evidence: Letters as in `Metric`, where they do not follow from `needs`.
-        args: What the function is called with after case and id; without it the function is called with the case alone.
+        of: Statistic of the `Samples` along the tunnel that the function returns; its interval is estimated with it.
+        args: What the function is called with after the case.
 
     Raises:
         FidelityError: The category is unknown, the id is taken, or `needs` or `map` is none.
@@ -179,16 +183,12 @@ def metric(
         if not callable(function):
             raise FidelityError(f"metric {id!r}: compute must be a function of a Case, got {type(function).__name__}")
         words = (function.__doc__ or id).strip().split("\n")[0].removesuffix(".")
-        compute = function if args is None else partial(_call_member, function, id, args)
         letters = _EVIDENCE[needs] if evidence is None else evidence
-        _METRICS[id] = Metric(0, category, id, words, unit, role, map, letters, needs, compute)
+        compute = lambda case: function(case, *args)  # noqa: E731
+        _METRICS[id] = Metric(0, category, id, words, unit, role, map, letters, needs, compute, of)
         return function
 
     return register
-
-
-def _call_member(function: Callable[..., Any], id: str, args: tuple[Any, ...], case: Any) -> Any:
-    return function(case, id, *args)
 
 
 _SUITE: set[str] = set()

@@ -34,7 +34,7 @@ from benchmarks.fidelity.derive.lining import (
 )
 from benchmarks.fidelity.derive.sections import dimensions, sections, variation
 from benchmarks.fidelity.registry import (
-    Statistic,
+    Samples,
     Value,
     estimate,
     mean,
@@ -60,24 +60,24 @@ _SAME_ROW = 0.05  # rad
 # CEN: the axis of the lining against the axis of the reference, sampled every metre.
 
 
-@metric("cl_lateral_rmse", "CEN", D(0.00588, 0.099), "m", gate=True, needs="reference")
-def cl_lateral_rmse(case: Case) -> Value:
+@metric("cl_lateral_rmse", "CEN", D(0.00588, 0.099), "m", gate=True, needs="reference", of=rms)
+def cl_lateral_rmse(case: Case) -> Samples:
     """Root mean square of the horizontal offset, m."""
-    return estimate(rms, axis_pair(case).left, axis_pair(case).station, case.rng("cl_lateral_rmse"))
+    return Samples(axis_pair(case).left, axis_pair(case).station)
 
 
-@metric("cl_lateral_p95", "CEN", D(0.0113, 0.4), "m", needs="reference")
-def cl_lateral_p95(case: Case) -> Value:
+@metric("cl_lateral_p95", "CEN", D(0.0113, 0.4), "m", needs="reference", of=percentile(95))
+def cl_lateral_p95(case: Case) -> Samples:
     """95th percentile of the horizontal offset, m."""
     both = axis_pair(case)
-    return estimate(percentile(95), np.abs(both.left), both.station, case.rng("cl_lateral_p95"))
+    return Samples(np.abs(both.left), both.station)
 
 
-@metric("cl_vertical_rmse", "CEN", D(0.00529, 0.2), "m", needs="reference")
-def cl_vertical_rmse(case: Case) -> Value:
+@metric("cl_vertical_rmse", "CEN", D(0.00529, 0.2), "m", needs="reference", of=rms)
+def cl_vertical_rmse(case: Case) -> Samples:
     """Root mean square of the vertical offset, m."""
     both = axis_pair(case)
-    return estimate(rms, both.judged[:, 2] - both.reference[:, 2], both.station, case.rng("cl_vertical_rmse"))
+    return Samples(both.judged[:, 2] - both.reference[:, 2], both.station)
 
 
 @metric("cl_length_rel_err", "CEN", D(0.0012, 5), "%", gate=True, needs="truth")
@@ -95,23 +95,23 @@ def cl_end_station_err(case: Case) -> Value:
     return number(max(abs(low - curve.station[0]), abs(high - curve.station[-1])), 2)
 
 
-@metric("cl_heading_rmse", "CEN", D(0.212, 3), "deg", needs="reference")
-def cl_heading_rmse(case: Case) -> Value:
+@metric("cl_heading_rmse", "CEN", D(0.212, 3), "deg", needs="reference", of=rms)
+def cl_heading_rmse(case: Case) -> Samples:
     """Root mean square of the heading error on a base of 2 m, degrees."""
     both = axis_pair(case)
     gap = chord_heading(both.judged) - chord_heading(both.reference)
     gap = np.rad2deg((gap + np.pi) % (2 * np.pi) - np.pi)
-    return estimate(rms, gap, both.station[1:-1], case.rng("cl_heading_rmse"))
+    return Samples(gap, both.station[1:-1])
 
 
-@metric("cl_curvature_rmse", "CEN", D(0.000805, 0.005), "1/m", needs="reference", args=(plan_curvature, 1.0))
-@metric("cl_grade_rmse", "CEN", D(0.144, 2), "%", needs="reference", args=(longitudinal_slope, 100.0))
-def axis_shape_error(case: Case, id: str, quantity: Callable[[np.ndarray], np.ndarray], factor: float) -> Value:
+@metric("cl_curvature_rmse", "CEN", D(0.000805, 0.005), "1/m", needs="reference", of=rms, args=(plan_curvature, 1.0))
+@metric("cl_grade_rmse", "CEN", D(0.144, 2), "%", needs="reference", of=rms, args=(longitudinal_slope, 100.0))
+def axis_shape_error(case: Case, quantity: Callable[[np.ndarray], np.ndarray], factor: float) -> Samples:
     """Root mean square error of curvature (1/m) or longitudinal slope (%), each over 10 m."""
     both = axis_pair(case)
     difference = quantity(both.judged) - quantity(both.reference)
     trim = (len(both.station) - len(difference)) // 2
-    return estimate(rms, factor * difference, both.station[trim : len(both.station) - trim], case.rng(id))
+    return Samples(factor * difference, both.station[trim : len(both.station) - trim])
 
 
 @metric("cl_axial_drift_slope", "CEN", D(1e-06, 3), "m/100 m", needs="truth")
@@ -146,48 +146,48 @@ def cl_icp_translation(case: Case) -> Value:
 # SEC: size and shape of the sections, every metre, pockets left out.
 
 
-@metric("sec_width_bias", "SEC", D(1e-06, 0.25), "m", needs="reference", args=("width", mean_magnitude))
-@metric("sec_width_rmse", "SEC", D(1e-06, 0.066), "m", needs="reference", args=("width", rms))
-@metric("sec_height_bias", "SEC", D(1e-06, 0.25), "m", needs="reference", args=("height", mean_magnitude))
-@metric("sec_height_rmse", "SEC", D(1e-06, 0.057), "m", needs="reference", args=("height", rms))
-def size_error(case: Case, id: str, name: str, statistic: Statistic) -> Value:
+@metric("sec_width_bias", "SEC", D(1e-06, 0.25), "m", needs="reference", of=mean_magnitude, args=("width",))
+@metric("sec_width_rmse", "SEC", D(1e-06, 0.066), "m", needs="reference", of=rms, args=("width",))
+@metric("sec_height_bias", "SEC", D(1e-06, 0.25), "m", needs="reference", of=mean_magnitude, args=("height",))
+@metric("sec_height_rmse", "SEC", D(1e-06, 0.057), "m", needs="reference", of=rms, args=("height",))
+def size_error(case: Case, name: str) -> Samples:
     """Error of the width 1.2 m above the floor, or of the height on the axis, m."""
     judged, reference = dimensions(case)[name]
-    return estimate(statistic, judged - reference, sections(case).station, case.rng(id))
+    return Samples(judged - reference, sections(case).station)
 
 
-@metric("sec_area_rel_err_mean", "SEC", D(1e-06, 0.91), "%", needs="reference", args=(mean,))
-@metric("sec_area_rel_err_p95", "SEC", D(1e-06, 2), "%", needs="reference", args=(percentile(95),))
-def area_error(case: Case, id: str, statistic: Statistic) -> Value:
+@metric("sec_area_rel_err_mean", "SEC", D(1e-06, 0.91), "%", needs="reference", of=mean)
+@metric("sec_area_rel_err_p95", "SEC", D(1e-06, 2), "%", needs="reference", of=percentile(95))
+def area_error(case: Case) -> Samples:
     """Relative error of the area, %."""
     judged, reference = dimensions(case)["area"]
-    return estimate(statistic, 100.0 * np.abs(judged / reference - 1.0), sections(case).station, case.rng(id))
+    return Samples(100.0 * np.abs(judged / reference - 1.0), sections(case).station)
 
 
-@metric("sec_iou_mean", "SEC", U(0.85, 0.999999), gate=True, needs="reference", args=(mean,))
-@metric("sec_iou_p05", "SEC", U(0.967, 0.999999), needs="reference", args=(percentile(5),))
-def outline_overlap(case: Case, id: str, statistic: Statistic) -> Value:
+@metric("sec_iou_mean", "SEC", U(0.85, 0.999999), gate=True, needs="reference", of=mean)
+@metric("sec_iou_p05", "SEC", U(0.967, 0.999999), needs="reference", of=percentile(5))
+def outline_overlap(case: Case) -> Samples:
     """Intersection over union of the outlines."""
     cut = sections(case)
     union = shapely.area(shapely.union(cut.judged_outline, cut.reference_outline))
-    return estimate(statistic, shapely.area(cut.common) / union, cut.station, case.rng(id))
+    return Samples(shapely.area(cut.common) / union, cut.station)
 
 
-@metric("sec_overbreak_vol", "SEC", D(1e-06, 0.99), "%", needs="reference", args=(0,))
-@metric("sec_underbreak_vol", "SEC", D(1e-06, 1.1), "%", needs="reference", args=(1,))
-def outside_volume(case: Case, id: str, side: int) -> Value:
+@metric("sec_overbreak_vol", "SEC", D(1e-06, 0.99), "%", needs="reference", of=mean, args=(0,))
+@metric("sec_underbreak_vol", "SEC", D(1e-06, 1.1), "%", needs="reference", of=mean, args=(1,))
+def outside_volume(case: Case, side: int) -> Samples:
     """Volume of one side (0 lining, 1 reference) outside the other, % of the reference's volume."""
     area = dimensions(case)["area"]
     outside = area[side] - shapely.area(sections(case).common)
-    return estimate(mean, 100.0 * outside / area[1].mean(), sections(case).station, case.rng(id))
+    return Samples(100.0 * outside / area[1].mean(), sections(case).station)
 
 
-@metric("sec_radial_rmse", "SEC", D(1e-06, 0.04), "m", needs="reference")
-def sec_radial_rmse(case: Case) -> Value:
+@metric("sec_radial_rmse", "SEC", D(1e-06, 0.04), "m", needs="reference", of=rms)
+def sec_radial_rmse(case: Case) -> Samples:
     """Root mean square error of the radius about the reference axis, where the reference is known, m."""
     cut = sections(case)
     error = (cut.judged - cut.reference).ravel()
-    return estimate(rms, error, np.repeat(cut.station, len(cut.angle)), case.rng("sec_radial_rmse"))
+    return Samples(error, np.repeat(cut.station, len(cut.angle)))
 
 
 @metric("sec_variation_corr", "SEC", U(0.3, 0.999999), needs="reference")
@@ -257,11 +257,11 @@ def _median_absolute(errors: np.ndarray) -> float:
     return float(np.median(np.abs(errors)))
 
 
-@metric("lin_pocket_depth_bias", "LIN", D(0.00262, 0.08), "m", needs="reference", args=("depth", mean_magnitude))
+@metric("lin_pocket_depth_bias", "LIN", D(0.00262, 0.08), "m", needs="reference", of=mean_magnitude, args=("depth",))
 @metric("lin_pocket_depth_mae", "LIN", D(0.00324, 0.08), "m", gate=True, needs="reference",
-        args=("depth", mean_absolute))  # fmt: skip
-@metric("lin_pocket_area_rel_err", "LIN", D(12.2, 60), "%", needs="reference", args=("area", _median_absolute))
-def matched_pocket_error(case: Case, id: str, name: str, statistic: Statistic) -> Value:
+        of=mean_absolute, args=("depth",))  # fmt: skip
+@metric("lin_pocket_area_rel_err", "LIN", D(12.2, 60), "%", needs="reference", of=_median_absolute, args=("area",))
+def matched_pocket_error(case: Case, name: str) -> Value | Samples:
     """Error of depth (m) or area (%) of the matched pockets."""
     if not len(reference_pockets(case)):
         return missing(_NO_POCKETS)
@@ -271,7 +271,7 @@ def matched_pocket_error(case: Case, id: str, name: str, statistic: Statistic) -
     judged, reference = judged_pockets(case), reference_pockets(case)
     size, real = getattr(judged, name)[pairs[:, 0]], getattr(reference, name)[pairs[:, 1]]
     error = size - real if name == "depth" else 100.0 * (size / real - 1.0)
-    return estimate(statistic, error, reference.station[pairs[:, 1]], case.rng(id))
+    return Samples(error, reference.station[pairs[:, 1]])
 
 
 @metric("lin_axial_pitch_err", "LIN", D(1e-06, 10), "%", needs="reference")
@@ -297,8 +297,8 @@ def lin_circ_pitch_err(case: Case) -> Value:
     return number(100.0 * abs(float(np.median(judged) / np.median(reference)) - 1.0), len(reference))
 
 
-@metric("lin_ring_phase_err", "LIN", D(1e-06, 0.25), needs="reference")
-def lin_ring_phase_err(case: Case) -> Value:
+@metric("lin_ring_phase_err", "LIN", D(1e-06, 0.25), needs="reference", of=mean)
+def lin_ring_phase_err(case: Case) -> Value | Samples:
     """Mean absolute error of the grid's phase in windows of four pitches, share of a pitch."""
     length = reference_pitch(case)
     if length is None:
@@ -308,7 +308,7 @@ def lin_ring_phase_err(case: Case) -> Value:
     gap = np.abs((judged[:count] - reference[:count] + np.pi) % (2 * np.pi) - np.pi) / (2 * np.pi)
     share = np.where(np.isnan(judged[:count]), _UNKNOWN_PHASE, gap)
     centre = length * PHASE_PITCHES / 2 * (1 + np.arange(count))
-    return estimate(mean, share, centre, case.rng("lin_ring_phase_err"))
+    return Samples(share, centre)
 
 
 @metric("lin_nail_count_ratio", "LIN")

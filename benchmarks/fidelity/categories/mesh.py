@@ -346,7 +346,7 @@ def _through_mouth(case: Case, origin: np.ndarray, direction: np.ndarray, end: i
 
 @metric("topo_free_b1_err", "TOP", D(1e-06, 4), "count", needs="reference", args=(1,))
 @metric("topo_free_b2_err", "TOP", D(1e-06, 4), "count", needs="reference", args=(2,))
-def lasting_difference(case: Case, id: str, dimension: int) -> Value:
+def lasting_difference(case: Case, dimension: int) -> Value:
     """Difference in the number of lasting loops (1) or of bodies that float in the free space (2)."""
     diagrams = candidate_diagrams(case)[dimension], reference_diagrams(case)[dimension]
     judged, real = (int(np.sum(d[:, 1] - d[:, 0] > _LASTING_PERSISTENCE * case.tolerance)) for d in diagrams)
@@ -355,7 +355,7 @@ def lasting_difference(case: Case, id: str, dimension: int) -> Value:
 
 @metric("topo_bottleneck_h0", "TOP", D(1e-06, 0.8), "m", needs="reference", args=(0,))
 @metric("topo_bottleneck_h1", "TOP", unit="m", needs="reference", args=(1,))
-def bottleneck_distance(case: Case, id: str, dimension: int) -> Value:
+def bottleneck_distance(case: Case, dimension: int) -> Value:
     """Bottleneck distance of the clearance diagrams of components (0) or loops (1), m."""
     import gudhi
 

@@ -32,15 +32,7 @@ from benchmarks.fidelity.derive.degeneracy import (
     localised_stations,
 )
 from benchmarks.fidelity.derive.distances import BOOTSTRAP_SAMPLES, self_cast
-from benchmarks.fidelity.registry import (
-    Statistic,
-    Value,
-    estimate,
-    mean_magnitude,
-    missing,
-    number,
-    percentile,
-)
+from benchmarks.fidelity.registry import Samples, Value, mean_magnitude, missing, number, percentile
 from benchmarks.fidelity.table import LOGGED_UP, D, U, metric
 
 _FAR = 0.20  # m
@@ -65,50 +57,50 @@ def _range_error(case: Case) -> tuple[np.ndarray, np.ndarray]:
     return cast_beams(case).difference[hit], returns(case).local[hit, 0]
 
 
-@metric("beam_range_mae", "BEA", D(0.0157, 0.072), "m", gate=True, needs="hold", args=(np.mean,))
-@metric("beam_range_medae", "BEA", D(0.0132, 0.06), "m", needs="hold", args=(np.median,))
-@metric("beam_range_p95", "BEA", D(0.0385, 0.2), "m", needs="hold", args=(percentile(95),))
-def range_error(case: Case, id: str, statistic: Statistic) -> Value:
+@metric("beam_range_mae", "BEA", D(0.0157, 0.072), "m", gate=True, needs="hold", of=np.mean)
+@metric("beam_range_medae", "BEA", D(0.0132, 0.06), "m", needs="hold", of=np.median)
+@metric("beam_range_p95", "BEA", D(0.0385, 0.2), "m", needs="hold", of=percentile(95))
+def range_error(case: Case) -> Samples:
     """Statistic of the absolute range difference, m."""
     error, station = _range_error(case)
-    return estimate(statistic, np.abs(error), station, case.rng(id), BOOTSTRAP_SAMPLES)
+    return Samples(np.abs(error), station, BOOTSTRAP_SAMPLES)
 
 
-@metric("beam_range_bias", "BEA", D(4.57e-05, 0.1), "m", needs="hold")
-def beam_range_bias(case: Case) -> Value:
+@metric("beam_range_bias", "BEA", D(4.57e-05, 0.1), "m", needs="hold", of=mean_magnitude)
+def beam_range_bias(case: Case) -> Samples:
     """Magnitude of the mean range difference, m."""
     error, station = _range_error(case)
-    return estimate(mean_magnitude, error, station, case.rng("beam_range_bias"), BOOTSTRAP_SAMPLES)
+    return Samples(error, station, BOOTSTRAP_SAMPLES)
 
 
-@metric("beam_rel_medae", "BEA", D(0.298, 1.3), "%", needs="hold")
-def beam_rel_medae(case: Case) -> Value:
+@metric("beam_rel_medae", "BEA", D(0.298, 1.3), "%", needs="hold", of=np.median)
+def beam_rel_medae(case: Case) -> Samples:
     """Median absolute range difference as a share of the range, %."""
     hit, (error, station) = cast_beams(case).hit, _range_error(case)
     relative = 100.0 * np.abs(error) / returns(case).range[hit]
-    return estimate(np.median, relative, station, case.rng("beam_rel_medae"), BOOTSTRAP_SAMPLES)
+    return Samples(relative, station, BOOTSTRAP_SAMPLES)
 
 
-@metric("beam_within_10cm", "BEA", U(0.85, 0.999754), needs="hold")
-def beam_within_10cm(case: Case) -> Value:
+@metric("beam_within_10cm", "BEA", U(0.85, 0.999754), needs="hold", of=np.mean)
+def beam_within_10cm(case: Case) -> Samples:
     """Share of the returns that the candidate gives within 10 cm; a beam that leaves it is not within."""
-    return _beam_share(case, "beam_within_10cm", np.abs(cast_beams(case).difference) <= 0.10 * case.tolerance)
+    return _beam_share(case, np.abs(cast_beams(case).difference) <= 0.10 * case.tolerance)
 
 
-@metric("beam_early_frac", "BEA", D(6.93e-05, 0.03), needs="hold")
-def beam_early_frac(case: Case) -> Value:
+@metric("beam_early_frac", "BEA", D(6.93e-05, 0.03), needs="hold", of=np.mean)
+def beam_early_frac(case: Case) -> Samples:
     """Share of the returns in front of which, by more than 20 cm, the candidate stands."""
-    return _beam_share(case, "beam_early_frac", cast_beams(case).difference < -_FAR * case.tolerance)
+    return _beam_share(case, cast_beams(case).difference < -_FAR * case.tolerance)
 
 
-@metric("beam_late_frac", "BEA", D(7.94e-05, 0.05), needs="hold")
-def beam_late_frac(case: Case) -> Value:
+@metric("beam_late_frac", "BEA", D(7.94e-05, 0.05), needs="hold", of=np.mean)
+def beam_late_frac(case: Case) -> Samples:
     """Share of the returns that the candidate gives more than 20 cm later, or not at all."""
-    return _beam_share(case, "beam_late_frac", cast_beams(case).difference > _FAR * case.tolerance)
+    return _beam_share(case, cast_beams(case).difference > _FAR * case.tolerance)
 
 
-def _beam_share(case: Case, id: str, marked: np.ndarray) -> Value:
-    return estimate(np.mean, marked.astype(float), returns(case).local[:, 0], case.rng(id), BOOTSTRAP_SAMPLES)
+def _beam_share(case: Case, marked: np.ndarray) -> Samples:
+    return Samples(marked.astype(float), returns(case).local[:, 0], BOOTSTRAP_SAMPLES)
 
 
 @metric("beam_return_bacc", "BEA", U(0.85, 0.99223), needs="hold")
@@ -290,24 +282,26 @@ def _condition(scans: ScanInformation) -> np.ndarray:
     return scans.translation[:, 2] / scans.translation[:, 0]
 
 
-@metric("deg_axial_info_logratio", "DEG", D(0.0543, 1), gate=True, needs="hold", args=(lambda scans: scans.axial,))
-@metric("deg_cond_logratio", "DEG", D(0.0823, 1), needs="hold", args=(_condition,))
-@metric("deg_rot_info_logratio", "DEG", D(0.00253, 0.14), needs="hold", args=(lambda scans: scans.rotation,))
-def information_logratio(case: Case, id: str, quantity) -> Value:
+@metric("deg_axial_info_logratio", "DEG", D(0.0543, 1), gate=True, needs="hold", of=np.median,
+        args=(lambda scans: scans.axial,))  # fmt: skip
+@metric("deg_cond_logratio", "DEG", D(0.0823, 1), needs="hold", of=np.median, args=(_condition,))
+@metric("deg_rot_info_logratio", "DEG", D(0.00253, 0.14), needs="hold", of=np.median,
+        args=(lambda scans: scans.rotation,))  # fmt: skip
+def information_logratio(case: Case, quantity) -> Samples:
     """Median over the scans of |log10| of the ratio of an information, synthetic over real."""
     real, synthetic = (quantity(scans) for scans in _both_information(case))
     log = np.abs(np.log10(synthetic / real))
     log = np.where(np.isfinite(real) & ~np.isfinite(synthetic), LOST, log)
-    return estimate(np.median, log, information(case, True).station, case.rng(id))
+    return Samples(log, information(case, True).station)
 
 
-@metric("deg_weak_angle_diff", "DEG", D(0.083, 25), "deg", needs="hold")
-def deg_weak_angle_diff(case: Case) -> Value:
+@metric("deg_weak_angle_diff", "DEG", D(0.083, 25), "deg", needs="hold", of=np.median)
+def deg_weak_angle_diff(case: Case) -> Samples:
     """Median angle between the weakest directions of translation, degrees."""
     real, synthetic = _both_information(case)
     cosine = np.abs(np.einsum("ij,ij->i", real.weakest, synthetic.weakest))
     angle = np.rad2deg(np.arccos(np.minimum(np.nan_to_num(cosine), 1.0)))
-    return estimate(np.median, angle, real.station, case.rng("deg_weak_angle_diff"))
+    return Samples(angle, real.station)
 
 
 @metric("deg_eig_w1", "DEG", D(0.0783, 0.8), needs="hold")

@@ -34,16 +34,7 @@ from benchmarks.fidelity.derive.routes import (
 )
 from benchmarks.fidelity.derive.sections import lining_radii, sections
 from benchmarks.fidelity.derive.surface import surface_nearest
-from benchmarks.fidelity.registry import (
-    Value,
-    estimate,
-    mean,
-    missing,
-    number,
-    pass_or_fail,
-    percentile,
-    root_of_mean,
-)
+from benchmarks.fidelity.registry import Samples, Value, mean, missing, number, pass_or_fail, percentile, root_of_mean
 from benchmarks.fidelity.table import B, D, P, U, metric
 
 _EDGE_NEAR = 0.10  # m between two edges that agree
@@ -58,30 +49,30 @@ _NO_REFERENCE = "the reference shows no way from mouth to mouth"
 # F2D: free space in the plane of the sensor.
 
 
-def _agreement(case: Case, id: str, among: np.ndarray, both: np.ndarray) -> Value:
+def _agreement(case: Case, among: np.ndarray, both: np.ndarray) -> Samples:
     """Share of the cells `among` that are free in `both`, where the reference is known."""
     picked = among & free_plane(case).known
     station = np.broadcast_to(free_plane(case).station[:, None], picked.shape)[picked]
-    return estimate(mean, both[picked].astype(float), station, case.rng(id))
+    return Samples(both[picked].astype(float), station)
 
 
-@metric("occ2d_free_iou", "F2D", U(0.85, 0.99624), gate=True, needs="reference")
-def occ2d_free_iou(case: Case) -> Value:
+@metric("occ2d_free_iou", "F2D", U(0.85, 0.99624), gate=True, needs="reference", of=mean)
+def occ2d_free_iou(case: Case) -> Samples:
     """Intersection over union of the free cells, where the reference is known."""
     judged, reference = free_plane(case).judged, free_plane(case).reference
-    return _agreement(case, "occ2d_free_iou", judged | reference, judged & reference)
+    return _agreement(case, judged | reference, judged & reference)
 
 
-@metric("occ2d_free_precision", "F2D", U(0.9, 0.999462), needs="reference")
-def occ2d_free_precision(case: Case) -> Value:
+@metric("occ2d_free_precision", "F2D", U(0.9, 0.999462), needs="reference", of=mean)
+def occ2d_free_precision(case: Case) -> Samples:
     """Share of the candidate's free cells that are free in the reference."""
-    return _agreement(case, "occ2d_free_precision", free_plane(case).judged, free_plane(case).reference)
+    return _agreement(case, free_plane(case).judged, free_plane(case).reference)
 
 
-@metric("occ2d_free_recall", "F2D", U(0.9, 0.99678), needs="reference")
-def occ2d_free_recall(case: Case) -> Value:
+@metric("occ2d_free_recall", "F2D", U(0.9, 0.99678), needs="reference", of=mean)
+def occ2d_free_recall(case: Case) -> Samples:
     """Share of the reference's free cells that are free in the candidate."""
-    return _agreement(case, "occ2d_free_recall", free_plane(case).reference, free_plane(case).judged)
+    return _agreement(case, free_plane(case).reference, free_plane(case).judged)
 
 
 @metric("occ2d_boundary_f1", "F2D", U(0.5, 0.999999), needs="reference")
@@ -101,12 +92,12 @@ def free2d_area_rel_err(case: Case) -> Value:
     return number(100.0 * abs(judged.sum() / max(reference.sum(), 1) - 1.0), int(reference.sum()))
 
 
-@metric("free2d_width_mae", "F2D", D(1e-06, 0.055), "m", needs="reference")
-def free2d_width_mae(case: Case) -> Value:
+@metric("free2d_width_mae", "F2D", D(1e-06, 0.055), "m", needs="reference", of=mean)
+def free2d_width_mae(case: Case) -> Samples:
     """Mean absolute error of the free width, m; an open side counts as 20 m."""
     station, judged, reference = free_widths(case)
     error = np.abs(np.minimum(judged, _WIDEST) - np.minimum(reference, _WIDEST))
-    return estimate(mean, error, station, case.rng("free2d_width_mae"))
+    return Samples(error, station)
 
 
 @metric("free2d_width_min_err", "F2D", D(1e-06, 0.12), "m", needs="reference")
@@ -116,14 +107,14 @@ def free2d_width_min_err(case: Case) -> Value:
     return number(abs(float(np.min(judged)) - float(np.min(reference))), len(judged))
 
 
-@metric("free2d_edt_rmse", "F2D", D(0.0302, 0.14), "m", needs="reference")
-def free2d_edt_rmse(case: Case) -> Value:
+@metric("free2d_edt_rmse", "F2D", D(0.0302, 0.14), "m", needs="reference", of=root_of_mean)
+def free2d_edt_rmse(case: Case) -> Samples:
     """Root mean square error of the distance to the edge of free space, where either is free, m."""
     judged, reference, rows = gapless_maps(case)
     picked = judged | reference
     clear = [_edge_distance(free, free_plane(case).lattice.edge) for free in (judged, reference)]
     station = np.broadcast_to(rows[:, None], picked.shape)[picked]
-    return estimate(root_of_mean, ((clear[0] - clear[1]) ** 2)[picked], station, case.rng("free2d_edt_rmse"))
+    return Samples(((clear[0] - clear[1]) ** 2)[picked], station)
 
 
 def _edge_distance(free: np.ndarray, edge: float) -> np.ndarray:
@@ -150,13 +141,13 @@ def occ2d_unknown_frac(case: Case) -> Value:
 # F3D: free space in three dimensions, along the reference axis.
 
 
-@metric("free3d_iou", "F3D", U(0.85, 0.998), gate=True, needs="reference")
-def free3d_iou(case: Case) -> Value:
+@metric("free3d_iou", "F3D", U(0.85, 0.998), gate=True, needs="reference", of=mean)
+def free3d_iou(case: Case) -> Samples:
     """Intersection over union of free voxels, where the reference is known."""
     both = air_voxels(case)
     either = (both.judged | both.reference) & both.known
     station = both.lattice.low[0] + both.lattice.edge * np.nonzero(either)[0]
-    return estimate(mean, (both.judged & both.reference)[either].astype(float), station, case.rng("free3d_iou"))
+    return Samples((both.judged & both.reference)[either].astype(float), station)
 
 
 @metric("free3d_volume_rel_err", "F3D", D(0.0161, 8), "%", needs="reference")
@@ -167,19 +158,19 @@ def free3d_volume_rel_err(case: Case) -> Value:
     return number(100.0 * abs(judged / max(reference, 1) - 1.0), int(reference))
 
 
-@metric("free3d_false_free", "F3D", D(1e-06, 0.05), needs="hold")
-def free3d_false_free(case: Case) -> Value:
+@metric("free3d_false_free", "F3D", D(1e-06, 0.05), needs="hold", of=mean)
+def free3d_false_free(case: Case) -> Samples:
     """Share of held-out returns deeper than 20 cm in the candidate's air."""
     points, deep = hold_points(case), _DEEP_RETURN * case.tolerance
     inside = lining_radii(case).depth(points) > deep
     wrong = np.zeros(len(points))
     if inside.any():
         wrong[inside] = surface_nearest(case).query(points[inside])[0] > deep
-    return estimate(mean, wrong, reference_curve(case).local(points)[:, 0], case.rng("free3d_false_free"))
+    return Samples(wrong, reference_curve(case).local(points)[:, 0])
 
 
-@metric("free3d_false_occupied", "F3D", D(1e-06, 0.05), needs="hold")
-def free3d_false_occupied(case: Case) -> Value:
+@metric("free3d_false_occupied", "F3D", D(1e-06, 0.05), needs="hold", of=mean)
+def free3d_false_occupied(case: Case) -> Samples:
     """Share of the length of held-out beams, up to 20 cm before their returns, that the candidate holds occupied.
 
     Occupied is whatever lies 5 cm outside its lining, and what its extra surfaces fill or close off.
@@ -192,45 +183,45 @@ def free3d_false_occupied(case: Case) -> Value:
         outside |= kept & both.filled.ravel()[cell]
     # Beyond the ends of the reference a beam still runs in air without a reconstruction.
     among = (local[:, 0] > both.lattice.low[0]) & (local[:, 0] < reference_curve(case).station[-1])
-    return estimate(mean, outside[among].astype(float), local[among, 0], case.rng("free3d_false_occupied"))
+    return Samples(outside[among].astype(float), local[among, 0])
 
 
-@metric("free3d_esdf_rmse", "F3D", D(1e-06, 0.3), "m", needs="reference")
-def free3d_esdf_rmse(case: Case) -> Value:
+@metric("free3d_esdf_rmse", "F3D", D(1e-06, 0.3), "m", needs="reference", of=root_of_mean)
+def free3d_esdf_rmse(case: Case) -> Samples:
     """Root mean square error of the distance to the nearest surface within 1 m of the axis, m."""
     both = axis_clearances(case)
     error = both.judged - both.reference
     station = np.repeat(both.station, error.shape[1])
-    return estimate(root_of_mean, (error**2).ravel(), station, case.rng("free3d_esdf_rmse"))
+    return Samples((error**2).ravel(), station)
 
 
-@metric("free3d_inscribed_err", "F3D", D(1e-06, 0.3), "m", needs="reference")
-def free3d_inscribed_err(case: Case) -> Value:
+@metric("free3d_inscribed_err", "F3D", D(1e-06, 0.3), "m", needs="reference", of=mean)
+def free3d_inscribed_err(case: Case) -> Samples:
     """Mean absolute error of the radius of the largest sphere near the axis, m."""
     both = axis_clearances(case)
     error = np.abs(both.judged.max(axis=1) - both.reference.max(axis=1))
-    return estimate(mean, error, both.station, case.rng("free3d_inscribed_err"))
+    return Samples(error, both.station)
 
 
-@metric("free3d_headroom_rmse", "F3D", D(1e-06, 0.06), "m", needs="reference")
-def free3d_headroom_rmse(case: Case) -> Value:
+@metric("free3d_headroom_rmse", "F3D", D(1e-06, 0.06), "m", needs="reference", of=root_of_mean)
+def free3d_headroom_rmse(case: Case) -> Samples:
     """Root mean square error of floor to crown in three lanes, m."""
     station, judged, reference = headrooms(case)
     squares = (judged - reference) ** 2
     lanes = np.repeat(station, squares.shape[1])
-    return estimate(root_of_mean, squares.ravel(), lanes, case.rng("free3d_headroom_rmse"))
+    return Samples(squares.ravel(), lanes)
 
 
-@metric("free3d_envelope_agree", "F3D", U(0.9, 0.999999), needs="reference")
-def free3d_envelope_agree(case: Case) -> Value:
+@metric("free3d_envelope_agree", "F3D", U(0.9, 0.999999), needs="reference", of=mean)
+def free3d_envelope_agree(case: Case) -> Samples:
     """Share of sections and envelopes in which lining and reference agree whether the envelope is cut into."""
     judged, reference = infringements(case)
     agree = (judged == reference).mean(axis=1)
-    return estimate(mean, agree, sections(case).station, case.rng("free3d_envelope_agree"))
+    return Samples(agree, sections(case).station)
 
 
-@metric("free3d_hold_poses_free", "F3D", U(0.95, 0.999999), gate=True, needs="hold")
-def free3d_hold_poses_free(case: Case) -> Value:
+@metric("free3d_hold_poses_free", "F3D", U(0.95, 0.999999), gate=True, needs="hold", of=mean)
+def free3d_hold_poses_free(case: Case) -> Samples:
     """Share of the sensor positions between the reference's mouths that are inside and 20 cm clear of any surface."""
     assert case.hold is not None
     at, curve = case.hold.origin[np.unique(case.hold.scan, return_index=True)[1]], reference_curve(case)
@@ -239,7 +230,7 @@ def free3d_hold_poses_free(case: Case) -> Value:
     at, station = at[within], station[within]
     clear = surface_nearest(case).query(at)[0] >= _SENSOR_CLEARANCE * case.tolerance
     free = (lining_radii(case).depth(at) > 0) & clear
-    return estimate(mean, free.astype(float), station, case.rng("free3d_hold_poses_free"))
+    return Samples(free.astype(float), station)
 
 
 @metric("free3d_voxel_vs_mesh_vol", "F3D", unit="%", needs="reference", evidence="S")
@@ -279,19 +270,19 @@ def nav_path_len_ratio(case: Case) -> Value:
     return ways if isinstance(ways, Value) else number(ways[0].length / ways[1].length, len(ways[0].place))
 
 
-@metric("nav_path_dev_p95", "NAV", D(1e-06, 0.8), "m", needs="reference")
-def nav_path_dev_p95(case: Case) -> Value:
+@metric("nav_path_dev_p95", "NAV", D(1e-06, 0.8), "m", needs="reference", of=percentile(95))
+def nav_path_dev_p95(case: Case) -> Value | Samples:
     """95th percentile of the distance from the way to the reference's, m."""
     ways = _both_ways(case)
     if isinstance(ways, Value):
         return ways
     apart = cKDTree(ways[1].place).query(ways[0].place)[0]
-    return estimate(percentile(95), apart, ways[0].place[:, 0], case.rng("nav_path_dev_p95"))
+    return Samples(apart, ways[0].place[:, 0])
 
 
 @metric("nav_clearance_min_err", "NAV", D(1e-06, 0.4), "m", needs="reference", args=(np.min,))
 @metric("nav_clearance_mean_err", "NAV", D(1e-06, 0.3), "m", needs="reference", args=(mean,))
-def way_clearance_error(case: Case, id: str, statistic) -> Value:
+def way_clearance_error(case: Case, statistic) -> Value:
     """Absolute error of the least or mean clearance on the way, m."""
     ways = _both_ways(case)
     if isinstance(ways, Value):
@@ -300,12 +291,12 @@ def way_clearance_error(case: Case, id: str, statistic) -> Value:
     return number(abs(float(judged - reference)), len(ways[0].place))
 
 
-@metric("nav_drivable_width_mae", "NAV", D(1e-06, 0.13), "m", needs="reference")
-def nav_drivable_width_mae(case: Case) -> Value:
+@metric("nav_drivable_width_mae", "NAV", D(1e-06, 0.13), "m", needs="reference", of=mean)
+def nav_drivable_width_mae(case: Case) -> Samples:
     """Mean absolute error of the drivable width, m."""
     judged, reference = both_grounds(case)
     error = np.abs(judged.width - reference.width)
-    return estimate(mean, error, judged.station, case.rng("nav_drivable_width_mae"))
+    return Samples(error, judged.station)
 
 
 @metric("nav_feasible_agree", "NAV", U(0.9, 0.999999), needs="reference")
@@ -328,8 +319,8 @@ def nav_blocked_diff(case: Case) -> Value:
     return number(abs(blocked_metres(judged) - blocked_metres(reference)), 1)
 
 
-@metric("nav_traversable_iou", "NAV", U(0.964, 0.999999), needs="reference")
-def nav_traversable_iou(case: Case) -> Value:
+@metric("nav_traversable_iou", "NAV", U(0.964, 0.999999), needs="reference", of=mean)
+def nav_traversable_iou(case: Case) -> Samples:
     """Intersection over union of traversable cells, where the reference sees the ground."""
     judged, reference = both_grounds(case)
     free = [judged.traversable, reference.traversable]
@@ -337,7 +328,7 @@ def nav_traversable_iou(case: Case) -> Value:
     if case.truth is None:
         among &= np.isfinite(reference.step) & np.isfinite(judged.step)
     station = np.broadcast_to(judged.station[:, None], among.shape)[among]
-    return estimate(mean, (free[0] & free[1])[among].astype(float), station, case.rng("nav_traversable_iou"))
+    return Samples((free[0] & free[1])[among].astype(float), station)
 
 
 @metric("nav_step_p95_err", "NAV", D(1e-06, 0.12), "m", needs="reference")

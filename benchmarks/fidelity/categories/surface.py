@@ -20,7 +20,7 @@ from benchmarks.fidelity.derive.distances import (
     told_together,
     tolerant_f1,
 )
-from benchmarks.fidelity.registry import Statistic, Value, estimate, mean_magnitude, missing, number, percentile, rms
+from benchmarks.fidelity.registry import Samples, Value, mean_magnitude, missing, number, percentile, rms
 from benchmarks.fidelity.table import LOGGED_UP, D, U, metric
 
 _FEWEST_IN_GROUP = 50  # points of a bin or sector that counts
@@ -33,31 +33,31 @@ _MOUTH_LENGTH = 2.0  # m
 # C2M: held-out points to the candidate, without any registration.
 
 
-@metric("c2m_mean", "C2M", D(0.0105, 0.048), "m", gate=True, needs="hold", args=(np.mean,))
-@metric("c2m_median", "C2M", D(0.0079, 0.1), "m", needs="hold", args=(np.median,))
-@metric("c2m_rmse", "C2M", D(0.014, 0.063), "m", needs="hold", args=(rms,))
-@metric("c2m_p95", "C2M", D(0.029, 0.13), "m", needs="hold", args=(percentile(95),))
-@metric("c2m_p99", "C2M", unit="m", needs="hold", args=(percentile(99),))
-def mesh_distance(case: Case, id: str, statistic: Statistic) -> Value:
+@metric("c2m_mean", "C2M", D(0.0105, 0.048), "m", gate=True, needs="hold", of=np.mean)
+@metric("c2m_median", "C2M", D(0.0079, 0.1), "m", needs="hold", of=np.median)
+@metric("c2m_rmse", "C2M", D(0.014, 0.063), "m", needs="hold", of=rms)
+@metric("c2m_p95", "C2M", D(0.029, 0.13), "m", needs="hold", of=percentile(95))
+@metric("c2m_p99", "C2M", unit="m", needs="hold", of=percentile(99))
+def mesh_distance(case: Case) -> Samples:
     """Statistic of the distance from held-out points to the surface, m."""
     distances = mesh_distances(case)
-    return estimate(statistic, distances.distance, distances.station, case.rng(id), BOOTSTRAP_SAMPLES)
+    return Samples(distances.distance, distances.station, BOOTSTRAP_SAMPLES)
 
 
-@metric("c2m_within_5cm", "C2M", U(0.83, 0.99776), needs="hold", args=(0.05,))
-@metric("c2m_within_10cm", "C2M", U(0.949, 0.999999), needs="hold", args=(0.10,))
-def mesh_precision(case: Case, id: str, within: float) -> Value:
+@metric("c2m_within_5cm", "C2M", U(0.83, 0.99776), needs="hold", of=np.mean, args=(0.05,))
+@metric("c2m_within_10cm", "C2M", U(0.949, 0.999999), needs="hold", of=np.mean, args=(0.10,))
+def mesh_precision(case: Case, within: float) -> Samples:
     """Share of held-out points within a distance of the surface; at 10 cm the paper's figure on unseen points."""
     distances = mesh_distances(case)
     near = (distances.distance <= within * case.tolerance).astype(float)
-    return estimate(np.mean, near, distances.station, case.rng(id), BOOTSTRAP_SAMPLES)
+    return Samples(near, distances.station, BOOTSTRAP_SAMPLES)
 
 
-@metric("c2m_signed_bias", "C2M", D(0.000154, 0.08), "m", needs="hold")
-def c2m_signed_bias(case: Case) -> Value:
+@metric("c2m_signed_bias", "C2M", D(0.000154, 0.08), "m", needs="hold", of=mean_magnitude)
+def c2m_signed_bias(case: Case) -> Samples:
     """Magnitude of the mean distance, signed by the side of the sensor, m."""
-    distances, rng = mesh_distances(case), case.rng("c2m_signed_bias")
-    return estimate(mean_magnitude, distances.signed, distances.station, rng, BOOTSTRAP_SAMPLES)
+    distances = mesh_distances(case)
+    return Samples(distances.signed, distances.station, BOOTSTRAP_SAMPLES)
 
 
 @metric("c2m_chainage_worst", "C2M", D(0.0109, 0.049), "m", needs="hold")
@@ -94,11 +94,11 @@ def c2m_fit_hold_gap(case: Case) -> Value:
     return number(max(gap, 0.0), len(mesh_distances(case).distance))
 
 
-@metric("m3c2_signif_frac", "C2M", D(1e-06, 0.5), needs="hold")
-def m3c2_signif_frac(case: Case) -> Value:
+@metric("m3c2_signif_frac", "C2M", D(1e-06, 0.5), needs="hold", of=np.mean)
+def m3c2_signif_frac(case: Case) -> Samples:
     """Share of core points whose M3C2 distance exceeds its level of detection."""
     distances = m3c2_distances(case)
-    return estimate(np.mean, distances.significant, distances.station, case.rng("m3c2_signif_frac"), BOOTSTRAP_SAMPLES)
+    return Samples(distances.significant, distances.station, BOOTSTRAP_SAMPLES)
 
 
 # CMP: completeness both ways, of the surface that held-out beams observed.
@@ -108,18 +108,18 @@ def _completeness(case: Case, within: float) -> np.ndarray:
     return (cloud_distances(case).distance <= within * case.tolerance).astype(float)
 
 
-@metric("comp_10cm", "CMP", U(0.86, 0.999836), needs="hold", args=(0.10,))
-@metric("comp_20cm", "CMP", LOGGED_UP, needs="hold", args=(0.20,))
-def completeness(case: Case, id: str, within: float) -> Value:
+@metric("comp_10cm", "CMP", U(0.86, 0.999836), needs="hold", of=np.mean, args=(0.10,))
+@metric("comp_20cm", "CMP", LOGGED_UP, needs="hold", of=np.mean, args=(0.20,))
+def completeness(case: Case, within: float) -> Samples:
     """Share of the observed surface with a held-out point within a distance."""
     station = cloud_distances(case).station
-    return estimate(np.mean, _completeness(case, within), station, case.rng(id), BOOTSTRAP_SAMPLES)
+    return Samples(_completeness(case, within), station, BOOTSTRAP_SAMPLES)
 
 
 @metric("fscore_5cm", "CMP", LOGGED_UP, needs="hold", args=(0.05,))
 @metric("fscore_10cm", "CMP", U(0.927, 0.9999181), gate=True, needs="hold", args=(0.10,))
 @metric("fscore_20cm", "CMP", U(0.8, 0.999999), needs="hold", args=(0.20,))
-def fscore(case: Case, id: str, within: float) -> Value:
+def fscore(case: Case, within: float) -> Value:
     """Harmonic mean of precision and completeness at a distance."""
     precision = float(np.mean(mesh_distances(case).distance <= within * case.tolerance))
     recall = float(np.mean(_completeness(case, within)))
@@ -163,12 +163,12 @@ def extra_surface_frac(case: Case) -> Value:
     return number(float(np.mean(phantom_cells(case))), len(phantom_cells(case)))
 
 
-@metric("missing_surface_frac", "CMP", D(1e-06, 0.1), needs="hold")
-def missing_surface_frac(case: Case) -> Value:
+@metric("missing_surface_frac", "CMP", D(1e-06, 0.1), needs="hold", of=np.mean)
+def missing_surface_frac(case: Case) -> Samples:
     """Share of held-out points with no surface within 20 cm."""
     distances = mesh_distances(case)
     far = (distances.distance > _FAR * case.tolerance).astype(float)
-    return estimate(np.mean, far, distances.station, case.rng("missing_surface_frac"), BOOTSTRAP_SAMPLES)
+    return Samples(far, distances.station, BOOTSTRAP_SAMPLES)
 
 
 # OCC: voxels of held-out points against the candidate seen by the same beams (the paper's Fig. 3).
@@ -190,7 +190,7 @@ def vox_iou_norm(case: Case) -> Value:
 
 @metric("vox_precision", "OCC", U(0.951, 0.99356), needs="hold", args=(1,))
 @metric("vox_recall", "OCC", U(0.967, 0.999867), needs="hold", args=(0,))
-def voxel_share(case: Case, id: str, side: int) -> Value:
+def voxel_share(case: Case, side: int) -> Value:
     """Share of the voxels of one side (1 the candidate, 0 the held-out cloud) that the other has too."""
     both = told_together(*occupied_voxels(case).points[:2])
     own = both[side].sum()
@@ -242,7 +242,7 @@ def _mouth_slices(case: Case) -> np.ndarray:
 @metric("vox_proj_iou_xy", "OCC", U(0.7, 0.99794), needs="hold", args=(2,))
 @metric("vox_proj_iou_xz", "OCC", U(0.7, 0.999816), needs="hold", args=(1,))
 @metric("vox_proj_iou_yz", "OCC", U(0.7, 0.9771), needs="hold", args=(0,))
-def projected_iou(case: Case, id: str, axis: int) -> Value:
+def projected_iou(case: Case, axis: int) -> Value:
     """Intersection over union seen along an axis: 0 the tunnel, 1 from the side, 2 from above."""
     real, first = (grid.sum(axis=axis) for grid in occupied_voxels(case).points[:2])
     return number(iou(*told_together(real, first)), int(real.sum()))

@@ -18,7 +18,7 @@ from benchmarks.fidelity.derive.track import (
     sleeper_spacings,
     sleepers_fit,
 )
-from benchmarks.fidelity.registry import Statistic, Value, estimate, missing, number, rms
+from benchmarks.fidelity.registry import Samples, Statistic, Value, missing, number, rms
 from benchmarks.fidelity.table import B, D, U, metric
 
 _SLEEPER_MATCH = 0.15  # m
@@ -54,7 +54,7 @@ def trk_sleeper_count_rel_err(case: Case) -> Value:
 
 @metric("trk_sleeper_spacing_err", "TRK", D(1e-06, 0.03), "m", needs="reference", evidence="HTK", args=(np.mean,))
 @metric("trk_sleeper_spacing_std_err", "TRK", D(1e-06, 0.06), "m", needs="reference", args=(np.std,))
-def spacing_error(case: Case, id: str, statistic: Statistic) -> Value:
+def spacing_error(case: Case, statistic: Statistic) -> Value:
     """Difference of mean or standard deviation of the spacings, missing sleepers left out, m."""
     real = sleeper_spacings(reference_sleepers(reference_railway(case)))
     judged = sleeper_spacings(candidate_sleepers(case))
@@ -103,14 +103,14 @@ def trk_gauge_p95_dev(case: Case) -> Value:
     return number(1e3 * np.percentile(np.abs(gauge - asked), 95), len(gauge), reason)
 
 
-@metric("trk_rail_lateral_rmse", "TRK", D(2.78e-06, 0.1), "m", needs="reference", args=(1,))
-@metric("trk_rail_height_rmse", "TRK", D(1e-06, 0.12), "m", needs="reference", args=(2,))
-def rail_offset(case: Case, id: str, column: int) -> Value:
+@metric("trk_rail_lateral_rmse", "TRK", D(2.78e-06, 0.1), "m", needs="reference", of=rms, args=(1,))
+@metric("trk_rail_height_rmse", "TRK", D(1e-06, 0.12), "m", needs="reference", of=rms, args=(2,))
+def rail_offset(case: Case, column: int) -> Value | Samples:
     """Root mean square offset of the track's middle (1 lateral, 2 in height), m."""
     if not reference_railway(case).rail.shape[1]:
         return missing(_NO_RAILS)
     offsets = rail_offsets(case)
-    return estimate(rms, offsets[:, column], offsets[:, 0], case.rng(id))
+    return Samples(offsets[:, column], offsets[:, 0])
 
 
 @metric("trk_rail_gap_max", "TRK", D(0.02, 0.5), "m")
