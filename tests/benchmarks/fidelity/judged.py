@@ -11,6 +11,16 @@ from benchmarks.fidelity.registry import Value, compute_metric
 from tests.benchmarks.fidelity import tube
 
 BEAMS = 2000
+DEFAULT, BARE, PLAIN = tube.Tube(), tube.Tube(depth=0.0, track=False), tube.Tube(track=False)
+SHORT = tube.Tube(length=12.0)
+
+
+@cache
+def against(right: tube.Tube, heard: bool = False, **changes) -> Case:
+    """A tube with other dimensions judged against a right one; `heard` by its recording alone."""
+    if heard:
+        return replace(against(right, **changes), truth=None, cache={})
+    return tube.case(right, replace(right, **changes))
 
 
 @cache

@@ -8,17 +8,9 @@ from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.derive.distances import mesh_distances
 from benchmarks.fidelity.derive.surface import Nearest
 from tests.benchmarks.fidelity import tube
-from tests.benchmarks.fidelity.judged import category, judged, measure, raw
+from tests.benchmarks.fidelity.judged import judged, measure, raw
 
 SIGMA = 0.02
-
-
-def test_the_right_tube_lies_within_the_noise_of_the_held_out_points():
-    assert raw("c2m_median", judged()) < 0.6745 * SIGMA
-    assert raw("c2m_signed_bias", judged()) < 0.001
-    assert raw("c2m_within_10cm", judged()) > 0.999
-    assert raw("m3c2_signif_frac", judged()) < 0.01
-    assert category("C2M", judged()) > 98.0
 
 
 def test_without_noise_the_distance_is_none():
@@ -34,23 +26,6 @@ def test_walls_ten_centimetres_too_wide_lie_five_centimetres_off_behind_the_poin
     assert np.median(found.signed[wall]) == pytest.approx(0.05, abs=0.002)
     assert raw("c2m_sector_worst", wide) > 0.035
     assert raw("c2m_signed_bias", wide) > 0.01
-
-
-def test_a_shortened_tube_fails_where_it_ends():
-    short = judged(length=14.0)
-    assert raw("c2m_chainage_worst", short) > 0.5
-    assert raw("c2m_mean", short) > 10 * raw("c2m_mean", judged())
-
-
-@pytest.mark.parametrize("spoilt", [{"width": 5.7}, {"shift": (0.08, 0.0)}, {"height": 6.4}, {"length": 15.0}])
-def test_a_spoilt_tube_scores_lower(spoilt):
-    assert category("C2M", judged(**spoilt)) < category("C2M", judged()) - 5.0
-
-
-def test_a_constant_tube_without_pockets_is_farther_off():
-    constant = judged(variation=0.0, depth=0.0)
-    for id in ("c2m_median", "c2m_noise_ratio", "c2m_rmse"):
-        assert raw(id, constant) > 1.2 * raw(id, judged())
 
 
 def test_the_gap_is_left_out_without_the_recording_that_was_fitted():

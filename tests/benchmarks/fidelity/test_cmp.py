@@ -7,14 +7,6 @@ from tests.benchmarks.fidelity import tube
 from tests.benchmarks.fidelity.judged import category, judged, obstructed, raw
 
 
-def test_the_right_tube_is_complete_and_has_nothing_too_much():
-    assert raw("comp_10cm", judged()) > 0.99
-    assert raw("fscore_10cm", judged()) > 0.99
-    assert raw("extra_surface_frac", judged()) < 0.001
-    assert raw("missing_surface_frac", judged()) == 0.0
-    assert category("CMP", judged()) > 99.0
-
-
 def test_missing_surface_is_the_share_of_returns_beyond_the_end():
     short = judged(length=14.0)
     beyond = tube.Tube().frames([14.0])
@@ -30,13 +22,6 @@ def test_an_obstacle_that_beams_pass_through_is_extra_surface():
     assert found == np.mean(phantom_cells(obstructed()))
     assert raw("comp_10cm", obstructed()) < raw("comp_10cm", judged())
     assert raw("hausdorff_p99", obstructed()) >= raw("hausdorff_p99", judged())
-
-
-def test_chamfer_grows_with_a_shift_and_the_f_score_falls():
-    shifted = judged(shift=(0.12, 0.0))
-    assert raw("chamfer_l1", shifted) > 1.5 * raw("chamfer_l1", judged())
-    assert raw("fscore_10cm", shifted) < raw("fscore_10cm", judged()) - 0.1
-    assert raw("dcd", shifted) > raw("dcd", judged()) + 0.1
 
 
 def test_a_finer_tolerance_never_gives_a_higher_share():

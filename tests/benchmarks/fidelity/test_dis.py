@@ -5,15 +5,7 @@ from scipy.spatial import cKDTree
 from benchmarks.fidelity.categories.sensor import middle_range
 from benchmarks.fidelity.derive.clouds import fit_planes, mean_entropy, voxel_map, voxel_wasserstein
 from benchmarks.fidelity.faults import Fault, Site, put_in
-from tests.benchmarks.fidelity.judged import category, judged, measure, obstructed, raw
-
-
-def test_the_right_tube_gives_the_same_distributions():
-    assert raw("range_ks", judged()) < 0.005
-    assert raw("range_w1", judged()) < 0.01
-    assert raw("incidence_w1", judged()) < 0.5
-    assert raw("c2st_auc", judged()) < 0.65
-    assert category("DIS", judged()) > 98.0
+from tests.benchmarks.fidelity.judged import judged, measure, obstructed, raw
 
 
 def test_a_moved_cloud_is_as_far_in_wasserstein_as_it_was_moved():
@@ -49,11 +41,6 @@ def test_a_local_plane_knows_its_normal_and_its_noise():
     assert np.median(found.residual) == pytest.approx(0.00674, rel=0.1)
 
 
-@pytest.mark.parametrize("id", ["range_ks", "range_w1", "elevation_w1", "azimuth_profile_rmse", "awd", "c2st_auc"])
-def test_a_wider_tube_shifts_the_distribution(id):
-    assert raw(id, judged(width=5.9)) > 1.5 * raw(id, judged())
-
-
 def test_the_middle_of_ranges_with_gaps_hardly_moves_with_half_of_the_beams():
     rng = np.random.default_rng(4)
     rings = np.repeat(4.0 * 1.2 ** np.arange(10), 100)  # m: where the rings of a scanner meet a bore
@@ -82,7 +69,3 @@ def test_what_is_not_recorded_is_missing():
 @pytest.mark.parametrize("id", ["mme_diff", "noise_sigma_diff", "scs_diff"])
 def test_map_statistics_are_finite_and_not_negative(id):
     assert raw(id, obstructed()) >= 0.0
-
-
-def test_a_tube_without_track_scores_lower():
-    assert category("DIS", judged(track=False)) < category("DIS", judged()) - 3.0

@@ -1,7 +1,7 @@
 """Metrics whose value on a tube of known dimensions is known, and what spoils them."""
 
 from dataclasses import replace
-from functools import cache
+from functools import partial
 
 import mujoco
 import numpy as np
@@ -14,17 +14,11 @@ from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.categories import scene as scene_metrics
 from benchmarks.fidelity.derive.beams import returns
 from tests.benchmarks.fidelity import tube, tubescene
-from tests.benchmarks.fidelity.judged import judged, measure, raw
+from tests.benchmarks.fidelity.judged import SHORT, against, judged, measure, raw
 from tests.benchmarks.fidelity.tube import Tube
 
 SIGMA = 0.02  # m, of the recording's ranges
-SHORT = Tube(length=12.0)
-
-
-@cache
-def short(**changes) -> Case:
-    """A short tube against itself, or against one with other dimensions."""
-    return tube.case(SHORT, replace(SHORT, **changes))
+short = partial(against, SHORT)
 
 
 def score(id: str, case: Case) -> float:

@@ -10,14 +10,6 @@ from benchmarks.fidelity.faults import Fault, Site, put_in
 from tests.benchmarks.fidelity.judged import category, judged, obstructed, raw
 
 
-def test_the_right_tube_reaches_the_ceiling_that_noise_leaves():
-    assert raw("vox_iou_norm", judged()) == pytest.approx(1.0, abs=0.02)
-    assert raw("vox_iou_20cm", judged()) < 1.0
-    assert raw("vox_f1_tol1", judged()) > 0.999
-    assert raw("vox_interior_mismatch", judged()) < 0.01
-    assert category("OCC", judged()) > 95.0
-
-
 def test_two_draws_differ_in_noise_alone():
     _, first, second = occupied_voxels(judged()).points > 0
     assert (first != second).any()
@@ -34,31 +26,9 @@ def test_f1_by_hand():
     np.testing.assert_allclose(tolerant_f1(grids, np.array([0, 0, 0, 1, 1, 1])), [1.0, 0.0], atol=1e-9)
 
 
-@pytest.mark.parametrize("id", ["vox_iou_norm", "vox_precision", "vox_recall", "vox_kappa", "vox_proj_iou_yz"])
-def test_a_shift_of_a_voxel_lowers(id):
-    assert raw(id, judged(shift=(VOXEL_EDGE, 0.0))) < raw(id, judged()) - 0.1
-
-
 def test_an_obstacle_is_a_mismatch_in_the_interior():
     assert raw("vox_interior_mismatch", obstructed()) > raw("vox_interior_mismatch", judged()) + 0.01
     assert raw("vox_f1_tol1", obstructed()) < raw("vox_f1_tol1", judged())
-
-
-def test_what_ends_early_lacks_its_last_stretch_and_its_mismatch_lies_at_the_mouth():
-    short = judged(length=14.0)
-    assert raw("vox_chainage_min_f1", short) < 0.9
-    assert raw("vox_recall", short) < 0.85 * raw("vox_recall", judged())
-    assert raw("vox_mouth_mismatch", short) > raw("vox_mouth_mismatch", judged())
-
-
-def test_a_constant_tube_scores_lower():
-    assert category("OCC", judged(variation=0.0, depth=0.0)) < category("OCC", judged())
-    assert category("OCC", judged(width=5.9)) < category("OCC", judged()) - 15.0
-
-
-@pytest.mark.parametrize("id", ["vox_proj_iou_xy", "vox_proj_iou_xz"])
-def test_projections_see_a_tube_that_is_too_big(id):
-    assert raw(id, judged(width=6.6, height=7.2)) < raw(id, judged()) - 0.05
 
 
 def test_poses_in_a_wrong_order_leave_the_path_and_spoil_the_agreement():

@@ -1,5 +1,5 @@
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -8,15 +8,12 @@ import trimesh
 from benchmarks.fidelity.derive.curve import Curve
 from benchmarks.fidelity.derive.mesh import Grid, persistence_diagrams
 from tests.benchmarks.fidelity import tube
-from tests.benchmarks.fidelity.judged import measure
+from tests.benchmarks.fidelity.judged import SHORT, against, measure
 
-SHORT = tube.Tube(length=12.0)
 MIDDLE = 6.13
 
 
-@cache
-def good():
-    return tube.case(SHORT)
+good = partial(against, SHORT)
 
 
 @cache
@@ -75,8 +72,7 @@ def test_held_out_returns_show_the_pillar_too():
 
 
 def test_a_narrower_bore_moves_the_diagram_by_what_it_is_narrower():
-    narrow = tube.Tube(length=12.0, width=5.0, height=5.6)
-    assert measure("topo_bottleneck_h0", tube.case(SHORT, narrow)).value == pytest.approx(0.3, abs=0.11)
+    assert measure("topo_bottleneck_h0", against(SHORT, width=5.0, height=5.6)).value == pytest.approx(0.3, abs=0.11)
 
 
 def test_a_hole_leaks_by_its_solid_angle_and_is_a_third_rim():
