@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
+from functools import cache
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -191,28 +192,28 @@ def metric(
     return register
 
 
-_SUITE: set[str] = set()
+@cache
+def _suite() -> dict[str, Metric]:
+    outside = set(_METRICS)
+    import benchmarks.fidelity.categories  # noqa: F401  (registers them)
+
+    return _numbered({id: row for id, row in _METRICS.items() if id not in outside})
 
 
 def load() -> dict[str, Metric]:
     """Return the metrics of the suite by id, by category and then as they stand in their files."""
-    if not _SUITE:
-        outside = set(_METRICS)
-        import benchmarks.fidelity.categories  # noqa: F401  (registers them)
-
-        _SUITE.update(set(_METRICS) - outside)
-    return _numbered({id: row for id, row in _METRICS.items() if id in _SUITE})
+    return dict(_suite())
 
 
 def load_all() -> dict[str, Metric]:
     """Return the metrics of the suite, then those from outside, by id."""
     suite = load()
-    return suite | _numbered({id: row for id, row in _METRICS.items() if id not in _SUITE}, len(suite))
+    return suite | _numbered({id: row for id, row in _METRICS.items() if id not in suite}, len(suite))
 
 
 def forget(ids: set[str]) -> None:
     """Forgets metrics from outside."""
-    for id in ids - _SUITE:
+    for id in ids - set(_suite()):
         _METRICS.pop(id, None)
     _order[:] = [id for id in _order if id in _METRICS]
 
