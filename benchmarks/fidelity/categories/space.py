@@ -13,7 +13,16 @@ from benchmarks.fidelity.derive.freespace import (
     headrooms,
     infringements,
 )
-from benchmarks.fidelity.derive.ground import both_grounds
+from benchmarks.fidelity.derive.ground import (
+    ROBOT_RADIUS,
+    Route,
+    blocked_metres,
+    both_grounds,
+    both_routes,
+    draw_trips,
+    feasible_trips,
+    judged_route,
+)
 from benchmarks.fidelity.derive.plane import (
     cell_distances,
     edge_cells,
@@ -22,15 +31,6 @@ from benchmarks.fidelity.derive.plane import (
     gapless_maps,
     medial_axis,
     unknown_share,
-)
-from benchmarks.fidelity.derive.routes import (
-    ROBOT_RADIUS,
-    Route,
-    blocked_metres,
-    both_routes,
-    draw_trips,
-    feasible_trips,
-    judged_route,
 )
 from benchmarks.fidelity.derive.sections import lining_radii, sections
 from benchmarks.fidelity.derive.surface import surface_nearest

@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from benchmarks.fidelity.derive.ground import cell_steps, judged_ground
-from benchmarks.fidelity.derive.routes import judged_route
+from benchmarks.fidelity.derive.ground import cell_steps, judged_ground, judged_route
 from tests.benchmarks.fidelity import tube
 from tests.benchmarks.fidelity.judged import SHORT, against, measure
 from tests.benchmarks.fidelity.tube import Tube

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.fidelity.files import FidelityError
-from benchmarks.fidelity.windows.reach import check_length, check_recording
+from benchmarks.fidelity.inputs import check_length, check_recording
 from tests.benchmarks.fidelity import tube
 
 SCENE, BAG = Path("tunnel"), Path("held.bag")
