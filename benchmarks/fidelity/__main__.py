@@ -15,6 +15,7 @@ import tyro
 
 from benchmarks.fidelity import judge, outside, scoring
 from benchmarks.fidelity.case import Case, case_hash
+from benchmarks.fidelity.faults import ladder
 from benchmarks.fidelity.faults.runner import Bench, Job, is_bold, is_ranked, judge_outcomes, list_jobs, run_jobs
 from benchmarks.fidelity.files import FidelityError, read_kept, write_json
 from benchmarks.fidelity.inputs import (
@@ -30,7 +31,6 @@ from benchmarks.fidelity.judge import Judgement
 from benchmarks.fidelity.leaks import find_leaks
 from benchmarks.fidelity.registry import Value, evaluate
 from benchmarks.fidelity.report import write_report
-from benchmarks.fidelity.windows import commands as windows
 from scene.errors import require_input
 from subterra_jax.host.command import parse, run_command
 from subterra_jax.host.files import require_folder
@@ -80,6 +80,21 @@ class SweepConfig(Inputs):
 
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     tolerances: tuple[float, ...] = (0.9, 1.1)
+
+
+@dataclass(frozen=True)
+class FaultsConfig(Inputs):
+    """Faults to draw.
+
+    Attributes:
+        draw: Seed that draws their places.
+        kinds: Kinds to put in; all that a size is asked of where empty.
+        places: Number of places of each kind.
+    """
+
+    draw: int = 0
+    kinds: tuple[str, ...] = ()
+    places: int = 6
 
 
 @dataclass(frozen=True)
@@ -215,6 +230,42 @@ def run_report(inputs: Inputs) -> None:
     _print_summary(_write_report(open_case(inputs)))
 
 
+def run_windows(inputs: Inputs) -> None:
+    """Judges a scene by its worst windows alone, in seconds.
+
+    Example: python -m benchmarks.fidelity windows --scene build/tunnel --recording held.bag --trajectory poses.tum
+    """
+    require_folder(inputs.out)
+    case = read_case(complete_inputs(inputs))
+    if not case.has("reference"):
+        raise FidelityError("windows need a reference: give --recording with --trajectory, or --truth")
+    reasons = judge.compute_windows(case, inputs.out).reasons()
+    print(f"windows of {case.candidate.name}: {'FAIL' if reasons else 'PASS'}")
+    for reason in reasons:
+        print(f"  {reason}")
+
+
+def run_faults(config: FaultsConfig) -> None:
+    """Finds the smallest fault noticed, of each of six kinds at random places; goes on where it was cut short.
+
+    Example: python -m benchmarks.fidelity faults --places 6 --scene build/tunnel --truth build/survey
+    """
+    require_folder(config.out)
+    ladder.check_ladder(config.kinds, config.places, config.draw)
+    case = read_case(complete_inputs(config))
+    if not case.has("reference"):
+        raise FidelityError("faults need a reference: give --recording with --trajectory, or --truth")
+    rows = ladder.climb_ladders(case, config.kinds, config.places, config.draw, config.out)
+    print(
+        f"{case.candidate.name}: smallest sizes noticed at 95 % of {config.places} places; {config.out / 'ladder.csv'}"
+    )
+    for one in ladder.write_ladder(config.out, rows):
+        factor, unit = (1000.0, "mm") if one["kind"] == "gauge" else (100.0, "cm")
+        print(f"  {one['kind']} over {one['length']:g} m: {factor * one['size_95']:.2g} {unit} "
+              f"({factor * one['low']:.2g} to {factor * one['high']:.2g}); {factor * one['asked']:g} {unit} noticed at "
+              f"{one['noticed_at_asked']} of {one['places']}")  # fmt: skip
+
+
 def run_split(config: SplitCommand) -> None:
     """Cut a recording into fit, val and hold by blocks of time.
 
@@ -258,7 +309,7 @@ def main() -> int:
     actions: dict[str, Callable[[Any], None]] = {
         "run": run, "controls": run_controls, "sweep": run_sweep,
         "split": run_split, "report": run_report,
-        "windows": windows.run_windows, "faults": windows.run_faults,
+        "windows": run_windows, "faults": run_faults,
     }  # fmt: skip
     commands = {name: _without_prefix(action) for name, action in actions.items()}
 

@@ -22,8 +22,9 @@ from benchmarks.fidelity.figures.tunnel import (
     draw_persistence,
     draw_range_image,
     draw_sensor_distributions,
+    draw_unrolled,
+    draw_worst_places,
 )
-from benchmarks.fidelity.figures.windows import draw_unrolled, draw_worst_places
 from benchmarks.fidelity.table import Need
 
 matplotlib.use("Agg")
