@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.fidelity import judge, scoring, table
-from benchmarks.fidelity.registry import Value
+from benchmarks.fidelity.registry import Value, missing
 
 # Whoever changes a threshold, weight, gate, limit or row on purpose writes the new digest here, with the reason.
 # Last: a metric stands with its function, a control is a fault by kind and size; limits, maps and gates are the same.
@@ -51,6 +51,17 @@ def test_a_failed_gate_caps_its_category_and_fails_the_verdict(gate: str) -> Non
     reasons = scoring.reasons_against(scored, None, None, [], [], [])
     assert any(reason.startswith(f"gate {gate} failed") for reason in reasons)
     assert f"category {category} is 50.0, below 70" in reasons
+
+
+@pytest.mark.parametrize("name", table.CATEGORIES)
+def test_a_category_is_scored_while_at_most_thirty_per_cent_of_it_are_missing(name: str) -> None:
+    rows = table.load()
+    perfect, own = {id: ideal(row) for id, row in rows.items()}, [i for i, r in rows.items() if r.category == name]
+    scored = [id for id in own if rows[id].scored]
+    most = int(0.3 * len(scored) + 1e-9)
+    for count, score in ((most, 100.0), (most + 1, None)):
+        found = scoring.score_all(perfect | dict.fromkeys(scored[:count], missing("none")))
+        assert found.categories[name] == score
 
 
 def test_every_metric_is_named_by_a_test() -> None:

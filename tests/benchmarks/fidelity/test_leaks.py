@@ -60,6 +60,11 @@ def test_the_noise_of_the_recording_is_found(case: Case) -> None:
     assert 0.4 * 0.02 < sigma < 1.3 * 0.02  # a beam meets the wall aslant, so less of its noise is across the plane
 
 
+def test_a_distance_below_half_of_the_noise_is_no_measurement(case: Case) -> None:
+    for median, found in ((0.0025, 1), (0.012, 0)):
+        assert len(leaks.noise_leaks(case, {"c2m_median": Value(median)})) == found
+
+
 def test_shared_points_are_duplicates(case: Case) -> None:
     assert leaks.duplicate_share(case.hold, case.hold) == 1.0
     assert (

@@ -52,6 +52,13 @@ def test_a_bore_that_collides_as_one_mesh_is_full_of_its_convex_hull(rewritten):
     assert measure("mj_ray_vs_mesh_mae", case).value < 1e-3  # rays alone would not notice
 
 
+@pytest.mark.parametrize(("aside", "free"), [(0.27, False), (0.34, True)])
+def test_a_thing_within_thirty_centimetres_of_the_axis_is_touched(rewritten, aside, free):
+    place = " ".join(f"{value:.4f}" for value in SHORT.point(6.0, aside, 0.0)[0])
+    case = rewritten("</worldbody>", f'<geom type="sphere" size="0.01" pos="{place}"/></worldbody>')
+    assert (measure("mj_probe_free_frac", case).value == 1.0) == free
+
+
 def test_panels_off_by_a_hand_are_touched_too_late(tmp_path):
     off = Case(load_candidate(tubescene.write(tmp_path / "tube", SHORT, panels_off=0.10)))
     assert measure("mj_wall_contact_err", off).value == pytest.approx(0.10, abs=0.01)
