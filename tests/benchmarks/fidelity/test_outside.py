@@ -10,7 +10,7 @@ from benchmarks.fidelity import judge, outside, table
 from benchmarks.fidelity.__main__ import main
 from benchmarks.fidelity.faults.rows import asked_faults
 from benchmarks.fidelity.faults.runner import Bench, Job, judge_outcomes, list_jobs, run_jobs
-from benchmarks.fidelity.registry import Value, number
+from benchmarks.fidelity.registry import Samples, Value, number
 from benchmarks.fidelity.table import D, U, metric
 from tests.benchmarks.fidelity import tube
 
@@ -62,6 +62,7 @@ def test_metrics_are_scored_beside_the_suite_and_leave_it_alone(tmp_path: Path) 
         return number(2.0)
 
     metric("lin_float", "LIN")(lambda case: 4.0)
+    metric("lin_along", "LIN", of=np.mean, args=(2.0,))(lambda case, k: Samples(k * np.arange(60), np.arange(60.0)))
     metric("sec_broken", "SEC", U(0, 1))(lambda case: 1 / 0)
     case = tube.case(tube.Tube(length=6.0))
     suite = {id: Value(1.0 if row.map.kind == "P" else row.map.target if row.map.kind == "B" else row.map.good)
@@ -74,6 +75,9 @@ def test_metrics_are_scored_beside_the_suite_and_leave_it_alone(tmp_path: Path) 
     assert base.scores["lin_given"].score == 50.0
     assert base.scores["lin_float"].score is None
     assert base.scores["lin_float"].value == Value(4.0)
+    along = base.scores["lin_along"].value
+    assert (along.value, along.n, along.extremes) == (59.0, 60, ((0.0, 9.0), (50.0, 109.0)))
+    assert along.interval[0] < 59.0 < along.interval[1]
     assert base.scores["sec_broken"].score == 0.0
     assert base.scores["sec_broken"].value.reason == "ZeroDivisionError: division by zero"
     scored = [row for row in table.load().values() if row.category == "LIN" and row.scored]
@@ -81,7 +85,7 @@ def test_metrics_are_scored_beside_the_suite_and_leave_it_alone(tmp_path: Path) 
     assert judged.scored["base"].categories["LIN"] == 100.0
     assert len(calls) == 4  # reconstruction, two null tubes, truth
     assert outside.metrics()["lin_given"].number == 200
-    assert len(table.load_all()) == 202
+    assert len(table.load_all()) == 203
     assert len(table.load()) == 199
 
 
