@@ -3,7 +3,7 @@
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -264,7 +264,7 @@ def _copy_messages(reader: Any, folder: Path, config: SplitConfig, recording: Pa
         raise FidelityError(f"{recording}: is shorter than five blocks of {config.block:g} s")
     dealt, counts = deal_blocks(duration, config), dict.fromkeys((*SPLIT_PARTS, "guard"), 0)
     with ExitStack() as stack, Stages() as progress:
-        make = Writer1 if recording.suffix == ".bag" else partial(Writer2, version=9)
+        make: Callable[[Path], Any] = Writer1 if recording.suffix == ".bag" else partial(Writer2, version=9)
         writers = [stack.enter_context(make(folder / _part_name(name, recording))) for name in SPLIT_PARTS]
         channels = [{c.id: _add_channel(writer, c) for c in reader.connections} for writer in writers]
         stage = progress.start("split", reader.message_count)

@@ -31,7 +31,7 @@ def without_faces(mesh: trimesh.Trimesh, gone: Bool[np.ndarray, " f"]) -> trimes
 def connected_groups(count: int, pairs: Int[np.ndarray, "k 2"]) -> Int[np.ndarray, " count"]:
     """Return the number of the group of each of `count` things; those of a pair belong together."""
     graph = coo_array((np.ones(len(pairs), bool), tuple(pairs.T)), shape=(count, count))
-    return connected_components(graph, directed=False)[1]
+    return np.asarray(connected_components(graph, directed=False)[1])
 
 
 def find_bodies(mesh: trimesh.Trimesh) -> tuple[Int[np.ndarray, " v"], Float[np.ndarray, "b 3"]]:

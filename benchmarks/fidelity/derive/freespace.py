@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import shapely
@@ -246,8 +247,8 @@ def _places_near_axis(case: Case) -> tuple[Float[np.ndarray, " n"], Float[np.nda
 
 @per_reference
 def _reference_clearances(case: Case) -> Float[np.ndarray, " k"]:
-    nearest = Nearest(case.truth.surface) if case.truth is not None else cKDTree(hold_points(case))
-    return nearest.query(_places_near_axis(case)[1])[0]
+    nearest: Any = Nearest(case.truth.surface) if case.truth is not None else cKDTree(hold_points(case))
+    return np.asarray(nearest.query(_places_near_axis(case)[1])[0])
 
 
 @per_case

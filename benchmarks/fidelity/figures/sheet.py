@@ -56,7 +56,7 @@ def bin_along(
 CLASSES = ListedColormap([AGREE, ONLY_MESH, ONLY_CLOUD])  # of a map of agreement
 
 
-def show_map(axes: plt.Axes, values: Float[np.ndarray, "n m"], extent: tuple[float, ...], **style: Any) -> AxesImage:
+def show_map(axes: plt.Axes, values: Float[np.ndarray, "n m"], extent: Any, **style: Any) -> AxesImage:
     """Draws a map with the tunnel along x, as it is: no cell is blended with another."""
     style = {"aspect": "auto", "interpolation": "nearest"} | style
     return axes.imshow(values.T, origin="lower", extent=extent, **style)

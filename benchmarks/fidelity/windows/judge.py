@@ -83,7 +83,7 @@ def _worst(case: Case, one: Measure, source: Source) -> Worst:
         return nothing
     k = int(np.nanargmax(series.value))
     start, end = stations_on_candidate(case, source, series, k)
-    found = {"value": float(series.value[k]), "where": series.where[k], "judged": series.judged}
+    found: dict[str, Any] = {"value": float(series.value[k]), "where": series.where[k], "judged": series.judged}
     return replace(nothing, start=start, end=end, **found)
 
 
