@@ -120,9 +120,9 @@ def run_jobs(bench: Bench, jobs: list[Job], processes: int = 2) -> list[Outcome]
             stage.resume(len(done))
         for outcome in _compute_outcomes(bench, todo, processes):
             done[outcome.job] = outcome
-            content = {"schema": OUTCOME_SCHEMA, "key": bench.key(outcome.job), "leaks": outcome.leaks}
             if bench.folder is not None:
-                content["values"] = dump_values(outcome.values)
+                content = {"schema": OUTCOME_SCHEMA, "key": bench.key(outcome.job), "leaks": outcome.leaks,
+                           "values": dump_values(outcome.values)}  # fmt: skip
                 write_json(bench.folder / f"{outcome.job.name}.json", content, digits=17)
             stage.advance()
     return [done[job] for job in jobs]
