@@ -137,6 +137,7 @@ class Metric:
 
 
 _METRICS: dict[str, Metric] = {}
+_own: set[str] = set()  # ids of the suite
 _order: list[str] = []  # ids as they stand in their files: decorators of one function are applied from below
 
 
@@ -184,6 +185,8 @@ def metric(
         if not callable(function):
             raise FidelityError(f"metric {id!r}: compute must be a function of a Case, got {type(function).__name__}")
         words = (function.__doc__ or id).strip().split("\n")[0].removesuffix(".")
+        if function.__module__.startswith("benchmarks.fidelity.categories."):
+            _own.add(id)
         letters = _EVIDENCE[needs] if evidence is None else evidence
         compute = lambda case: function(case, *args)  # noqa: E731
         _METRICS[id] = Metric(0, category, id, words, unit, role, map, letters, needs, compute, of)
@@ -194,10 +197,9 @@ def metric(
 
 @cache
 def _suite() -> dict[str, Metric]:
-    outside = set(_METRICS)
     import benchmarks.fidelity.categories  # noqa: F401  (registers them)
 
-    return _numbered({id: row for id, row in _METRICS.items() if id not in outside})
+    return _numbered({id: row for id, row in _METRICS.items() if id in _own})
 
 
 def load() -> dict[str, Metric]:

@@ -109,11 +109,9 @@ KNOWN = (
 )  # fmt: skip
 
 
-def name(value: object) -> str:
-    return str(value).translate(str.maketrans("", "", "{}' ")) if isinstance(value, dict) else ""
-
-
-@pytest.mark.parametrize(("right", "changes", "known"), KNOWN, ids=lambda one: name(one)[:60])
+@pytest.mark.parametrize(
+    ("right", "changes", "known"), KNOWN, ids=[f"{next(iter(ids))[:3]}-{changes}" for _, changes, ids in KNOWN]
+)
 def test_a_tube_of_other_dimensions_has_the_values_that_follow(right, changes, known) -> None:
     case = judged(**changes) if right == DEFAULT else against(right, **changes)
     values = {id: raw(id, case) for id in known}
