@@ -23,16 +23,14 @@ from scene.cleaning.crop import crop_cloud, describe_chainage, keep_stations, tu
 from scene.config import BuildConfig, ReconstructConfig, check_number, check_settings
 from scene.errors import FitError, RecordingError, require_input
 from scene.fitting.assemble import describe_bore, fit_unfolded
-from scene.fitting.gauge import measure_gauge
 from scene.fitting.lining import add_lining
 from scene.fitting.rings import fit_ring_survey
-from scene.fitting.trackseen import find_track
+from scene.fitting.trackseen import find_track, measure_gauge
 from scene.judging.judge import Judgement, JudgingConfig, judge_bore, require_trust
 from scene.judging.layers import doubt_layers
 from scene.judging.page import render_page
 from scene.judging.returns import track_zone
-from scene.judging.sanity import doubt_bore
-from scene.judging.trackdoubt import doubt_track
+from scene.judging.sanity import doubt_bore, doubt_track
 from scene.poses.calibration import UNCALIBRATED, Calibration, find_calibration
 from scene.poses.place import Placed, place_cloud, place_recording
 from scene.progress import Stages
@@ -64,7 +62,7 @@ def build(
     """Reconstructs the tunnel in `source` and writes its scene folder whole, or not at all.
 
     Args:
-        source: The input; see `reconstruct`.
+        source: The input.
         out: Folder to write; a previous one is replaced once the new one is complete.
         trajectory: Poses for a bag, TUM.
         config: Settings; the defaults where not given.
@@ -127,17 +125,9 @@ def reconstruct(
     partial: Partial | None = None,
     more: tuple[Path, ...] = (),
 ) -> Reconstruction:
-    """Detects the kind of an input and builds its bore.
+    """Detects the kind of an input, of any format that `scene.reading.formats` knows, and builds its bore.
 
-    Args:
-        source: A recording, a registered cloud or a ring survey, of any format that `scene.reading.formats` knows.
-        trajectory: Poses in TUM form, for a recording.
-        config: Settings.
-        progress: Shows the stages.
-        control: Positions in TUM form, for a recording without a trajectory.
-        calibration: Mounts of prism and IMU against the LiDAR.
-        partial: Partial results of an earlier build, and place for those of this one; none are kept without it.
-        more: Further bags of the same recording.
+    Takes what `build` takes; no partial results are kept without `partial`.
 
     Raises:
         RecordingError: Unreadable, or of no known kind.

@@ -1,5 +1,6 @@
 """Errors of a recording, each with one clear sentence."""
 
+from enum import StrEnum
 from pathlib import Path
 
 from subterra_jax.host.errors import SubterraError
@@ -7,6 +8,21 @@ from subterra_jax.host.errors import SubterraError
 
 class RecordingError(SubterraError):
     """An input cannot be read, or is not what it says it is."""
+
+
+class Refusal(StrEnum):
+    """Why no bore can be built from a cloud, for programs; a bore that was built is refused by its warning's code."""
+
+    NO_BORE = "no_bore"  # Nothing in it is enclosed, or lies on a wall around an open middle
+    OPEN = "open"  # Open above: a street or a cutting
+    PLANE = "plane"  # All points on one plane
+    UPRIGHT = "upright"  # A vertical shaft
+    ROOM = "room"  # Not longer than wide, or much wider than usual on the way
+    NARROW = "narrow"  # Too narrow to be followed
+    SHORT = "short"  # Shorter than the least length
+    BRANCH = "branch"  # A branch, with `--strict`
+    UNSEEN = "not_seen"  # Too little of the wall was seen, or profiles are too far apart
+    FOLDED = "folded"  # Sections cut each other
 
 
 class FitError(SubterraError):

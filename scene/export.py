@@ -23,6 +23,7 @@ from trimesh.visual.material import PBRMaterial
 
 from scene.errors import RecordingError, require_input
 from scene.robot import write_urdf
+from scene.writing.markup import write_xml
 from subterra_jax.host.command import parse, run_command
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.host.files import replace_file, replace_folder, require_file, require_folder
@@ -34,41 +35,27 @@ _ENDINGS = {"glb": (".glb",), "usd": (".usda", ".usdc", ".usd"), "sdf": (), "urd
 
 @dataclass(frozen=True)
 class ExportConfig:
-    """The scene for a web page, Isaac Sim and Gazebo.
+    """The scene for a web page, Isaac Sim and Gazebo."""
 
-    Attributes:
-        scene: Scene folder, as `scene.build` writes it.
-        to: `glb` (glTF), `usd` (OpenUSD with physics schemas), `sdf` (a Gazebo model folder), or `urdf`: not the scene
-            but the robot that it comes with.
-        out: File to write, for `sdf` a folder; named after the scene, beside it, if not given.
-        furnished: With lineside furniture.
-        licence: Licence of the scene, put into the file.
-    """
-
+    # Scene folder, as `scene.build` writes it.
     scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
+    # `glb` (glTF), `usd` (OpenUSD with physics schemas), `sdf` (a Gazebo model folder), or `urdf`: not the scene but
+    # the robot that it comes with.
     to: Literal["glb", "usd", "sdf", "urdf"]
-    out: Path | None = None
-    furnished: bool = False
-    licence: str = "as that of the recording"
+    out: Path | None = None  # File to write, for `sdf` a folder; named after the scene, beside it, if not given.
+    furnished: bool = False  # With lineside furniture.
+    licence: str = "as that of the recording"  # Licence of the scene, put into the file.
 
 
 @dataclass(frozen=True)
 class Part:
-    """Triangles of one material.
+    """Triangles of one material."""
 
-    Attributes:
-        name: Name of the material.
-        vertices: Corners, tunnel frame, m.
-        faces: Corner numbers of each triangle.
-        colour: Red, green, blue and opacity, 0 to 1.
-        roughness: 1 for matt, 0 for a mirror.
-    """
-
-    name: str
-    vertices: Float[np.ndarray, "v 3"]
-    faces: Int[np.ndarray, "f 3"]
-    colour: tuple[float, float, float, float]
-    roughness: float
+    name: str  # Name of the material.
+    vertices: Float[np.ndarray, "v 3"]  # Corners, tunnel frame, m.
+    faces: Int[np.ndarray, "f 3"]  # Corner numbers of each triangle.
+    colour: tuple[float, float, float, float]  # Red, green, blue and opacity, 0 to 1.
+    roughness: float  # 1 for matt, 0 for a mirror.
 
 
 def read_parts(path: Path) -> list[Part]:
@@ -207,9 +194,8 @@ def write_sdf(folder: Path, parts: list[Part], facts: dict[str, Any]) -> None:
     for key, text in (("name", name), ("version", "1.0"), ("description", json.dumps(facts))):
         ET.SubElement(config, key).text = text
     ET.SubElement(config, "sdf", version="1.9").text = "model.sdf"
-    for name, element in (("model.sdf", root), ("model.config", config)):
-        ET.indent(element)
-        (folder / name).write_bytes(ET.tostring(element, encoding="utf-8", xml_declaration=True) + b"\n")
+    write_xml(folder / "model.sdf", root)
+    write_xml(folder / "model.config", config)
 
 
 def _add_shape(link: ET.Element, part: Part, kind: str, uri: str) -> ET.Element:

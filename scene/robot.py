@@ -7,23 +7,16 @@ import mujoco
 import numpy as np
 
 from scene.errors import RecordingError, require_input
+from scene.writing.markup import write_xml
 
 _NAME = "scout"
 
 
 def write_urdf(path: Path, scene: Path, comment: str) -> None:
-    """Write the robot of a scene: `base_link` with all its shapes, and the frame `lidar` on a fixed joint.
+    """Write the robot of a scene's MJCF: `base_link` with all its shapes, and the frame `lidar` on a fixed joint.
 
-    URDF has no capsule: it becomes a cylinder between two balls. There is no free joint either; programs that load
-    URDF give the base one.
-
-    Args:
-        path: File to write.
-        scene: The scene's MJCF.
-        comment: Text to keep in the file.
-
-    Raises:
-        RecordingError: The file is no MJCF, or has no such robot.
+    URDF has no capsule: it becomes a cylinder between two balls. There is no free joint either; programs that load URDF
+    give the base one. `comment` is kept in the file. Raises `RecordingError` for no MJCF, or one without such a robot.
     """
     body = _read_body(scene)
     model = _compile(body)
@@ -47,8 +40,7 @@ def write_urdf(path: Path, scene: Path, comment: str) -> None:
         _place(joint, model.site_pos[site], model.site_quat[site])
         ET.SubElement(joint, "parent", link="base_link")
         ET.SubElement(joint, "child", link=name)
-    ET.indent(robot)
-    path.write_bytes(ET.tostring(robot, encoding="utf-8", xml_declaration=True) + b"\n")
+    write_xml(path, robot)
 
 
 def _read_body(scene: Path) -> ET.Element:

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from benchmarks.truth import compare, load_truth
-from scene.bore import make_axis
+from scene.geometry import make_axis
 
 ROOT = Path(__file__).parents[1]
 LENGTH, SEED = 24, 11  # a seed that the builder was not developed on

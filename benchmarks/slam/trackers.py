@@ -26,7 +26,7 @@ from benchmarks.slam.arena.wheels import SCALE, SCALE_PIECE, SCALE_SIGMA
 from benchmarks.slam.reading import CALIBRATION, Poses, read_samples
 from scene.poses.trajectory import Trajectory, load_tum
 from scene.survey.cast import Caster
-from scene.survey.sizes import DESIGN
+from scene.survey.furniture import DESIGN
 from subterra_jax.baselines import cloud as particles
 from subterra_jax.baselines.reckoning import StepDistances
 from subterra_jax.baselines.rings import grid

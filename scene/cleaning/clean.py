@@ -1,4 +1,7 @@
-"""The steps of cleaning, in order: leave out strays, look for places inside a bore, follow it, sort the returns."""
+"""The steps of cleaning, in order: leave out strays, look for places inside a bore, follow it, sort the returns.
+
+A cloud in which no bore can be seen is refused by the name of what it is.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,16 +13,15 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import maximum_filter1d
 from scipy.spatial import cKDTree
 
-from scene.bore import Axis
 from scene.cleaning.follow import Course, follow_bore, join_courses
-from scene.cleaning.refusal import name_cloud
 from scene.cleaning.removed import Cause, Cleaned, list_removed, part_of_cloud
-from scene.cleaning.seeds import Seed, find_seeds
+from scene.cleaning.seeds import N_RAYS, Seed, find_seeds
 from scene.cleaning.sort import end_stations, has_support, look_around, name_bodies, sort_points
 from scene.cleaning.tube import Tube, measure_tube
 from scene.cloud import Cloud, thin_and_count
-from scene.errors import FitError
+from scene.errors import FitError, Refusal
 from scene.fitting.centreline import CentrelineConfig, centre_axis, smooth_axis
+from scene.geometry import Axis, bin_angles
 
 _COARSE = 0.15  # m, voxel of the cloud that is followed
 _REACH, _AROUND = 3.0, 5  # times the template, and directions around: as far as the wall is looked for
@@ -28,7 +30,7 @@ _LITTLE = 0.002  # share of the points: with less to remove, the cloud is clean
 _FEWEST = 200  # points
 _TRIED = 8  # seeds followed
 _ENCLOSED = 0.65  # share of the directions
-_ELONGATION = 1.4  # least length over width
+_ELONGATION = 1.6  # least length over width
 _ABOVE, _CROWN, _STREET = 0.8, 0.15, 7.0  # sine of directions above; share of them matched; m
 _FLAG = tyro.conf.arg(prefix_name=False)
 
@@ -51,11 +53,12 @@ def clean_cloud(cloud: Cloud, config: CleaningConfig, centreline: CentrelineConf
     thinned, count = thin_and_count(part_of_cloud(cloud, np.flatnonzero(supported)), _COARSE)
     coarse = thinned.astype(np.float64)
     if len(coarse) < _FEWEST:
-        raise FitError(f"no tunnel in the cloud: it holds {len(coarse)} places of {_COARSE:g} m; {_FEWEST} are needed")
+        why = f"no tunnel in the cloud: it holds {len(coarse)} places of {_COARSE:g} m; {_FEWEST} are needed"
+        raise FitError(why, Refusal.NO_BORE)
     seeds = find_seeds(coarse)
     course = longest_course(coarse, seeds)
     if course is None or course.length < max(centreline.min_length, _ELONGATION * course.width):
-        raise FitError(name_cloud(coarse, seeds, course, centreline.min_length))
+        raise refuse_cloud(coarse, seeds, course, centreline.min_length)
     axis = smooth_axis(course.position, centreline.cutoff)
     reach = _REACH * maximum_filter1d(course.usual, _AROUND, mode="wrap")
     for _ in range(2):
@@ -76,7 +79,7 @@ def clean_cloud(cloud: Cloud, config: CleaningConfig, centreline: CentrelineConf
     removed = list_removed(cloud, cause, look_around(points, axis).station, _STRETCH, behind)
     warning = next((part.warning for part in removed if part.warning), "")
     if config.strict and warning:
-        raise FitError(warning)
+        raise FitError(warning, Refusal.BRANCH)
     return Cleaned(kept, axis, removed, cause)
 
 
@@ -107,18 +110,21 @@ def require_crown(tube: Tube) -> None:
     sides = np.abs(np.cos(tube.grid.angle)) > _ABOVE
     width = 2 * float(np.median(tube.usual[:, sides]))
     if width > _STREET and tube.matched[:, above].mean() < _CROWN:
-        raise FitError(f"no tunnel in the cloud: open above and {width:.0f} m wide, so a street or a cutting")
+        why = f"no tunnel in the cloud: open above and {width:.0f} m wide, so a street or a cutting"
+        raise FitError(why, Refusal.OPEN)
 
 
 def longest_course(points: Float[np.ndarray, "n 3"], seeds: list[Seed]) -> Course | None:
     """Follows the likeliest places and returns the longest bore; `None` where no place is enclosed.
 
-    Bores that go on from one another are one.
+    Bores that go on from one another are one. A place that is too wide for the length of the cloud lies in a room.
     """
     tree = cKDTree(points)
     courses: list[Course] = []
     for seed in seeds:
         if seed.enclosed < _ENCLOSED or len(courses) >= _TRIED:
+            continue
+        if float(np.ptp(points @ seed.direction)) < _ELONGATION * seed.width:
             continue
         if any(_holds(course, seed.position) for course in courses):
             continue
@@ -140,8 +146,8 @@ def stand_in(tube: Tube, axis: Axis, at: Axis) -> Float[np.ndarray, "k rays"]:
     station, lateral, upward = axis.local(at.position)
     rows = np.clip(((station - tube.grid.start) / tube.grid.step).astype(np.intp), 0, tube.grid.rows - 1)
     turn = tube.grid.angle
-    centres = -np.pi + 2 * np.pi * (np.arange(72) + 0.5) / 72
-    result = np.empty((len(rows), 72))
+    centres = bin_angles(N_RAYS)
+    result = np.empty((len(rows), N_RAYS))
     for k, row in enumerate(rows):
         y = tube.usual[row] * np.cos(turn) - lateral[k]
         z = tube.usual[row] * np.sin(turn) - upward[k]
@@ -149,3 +155,66 @@ def stand_in(tube: Tube, axis: Axis, at: Axis) -> Float[np.ndarray, "k rays"]:
         order = np.argsort(angle)
         result[k] = np.interp(centres, angle[order], np.hypot(y, z)[order], period=2 * np.pi)
     return result
+
+
+_FLAT = 0.04  # of the longest extent
+_OPEN = 0.6  # share of the unseen directions that lie above
+_THIN, _LOW = 0.3, 2.0  # m, heights between which a cloud may be a culvert or a pipe
+_NARROW = "no tunnel was found in the cloud: a bore under about 1.5 m is too narrow to be followed, "
+_TALL = 1.2  # times the larger extent in plan
+
+
+def refuse_cloud(
+    points: Float[np.ndarray, "n 3"], seeds: list[Seed], course: Course | None, min_length: float
+) -> FitError:
+    """Return the error that names what a cloud without a bore is.
+
+    `course` is the longest bore that could be followed, shorter than `min_length`, m, or than it is wide.
+    """
+    centred = points - points.mean(axis=0)
+    sample = centred[:: max(1, len(points) // 20_000)]
+    plan = _principal(sample[:, :2])
+    run, across = (_extent(sample[:, :2] @ axis) for axis in plan)
+    height = _extent(sample[:, 2])
+    thickness = float(np.ptp(np.percentile(sample @ _principal(sample)[2], [5, 95])))
+    size = f"{run:.0f} m by {across:.0f} m in plan and {height:.0f} m high"
+    short = FitError(f"the tunnel is at most {run:.1f} m long; at least {min_length:g} m are needed", Refusal.SHORT)
+    narrow = FitError(_NARROW + size, Refusal.NARROW)
+    if max(run, height) < min_length:
+        return short
+    if across < _LOW and _THIN < height < _LOW:
+        return narrow
+    if thickness < _FLAT * max(run, across, height):
+        return FitError(f"no tunnel in the cloud: its points lie on a plane, {size}", Refusal.PLANE)
+    if height > max(_TALL * run, min_length):
+        return FitError(f"no tunnel in the cloud: a vertical shaft, {size}", Refusal.UPRIGHT)
+    if run < min_length:
+        return short
+    best = max(seeds, key=lambda seed: seed.enclosed, default=None)
+    if best is not None and is_open_above(best.radius):
+        return FitError(f"no tunnel in the cloud: open above, so a street or a cutting, {size}", Refusal.OPEN)
+    if course is not None:
+        way = f"the longest way enclosed by walls is {course.length:.0f} m long and {course.width:.0f} m wide"
+        return FitError(f"a room, not a tunnel: {size}; {way}", Refusal.ROOM)
+    if _THIN < height < _LOW:
+        return narrow
+    if best is not None and best.enclosed >= _ENCLOSED:
+        way = f"enclosed, and nowhere {_ELONGATION:g} times as long as it is wide"
+        return FitError(f"a room, not a tunnel: {size}, {way}", Refusal.ROOM)
+    return FitError(f"no tunnel in the cloud: no place in it is enclosed all around, {size}", Refusal.NO_BORE)
+
+
+def _principal(centred: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "k k"]:
+    """Unit vectors of the longest to the shortest extent."""
+    return np.linalg.eigh(centred.T @ centred)[1].T[::-1]
+
+
+def _extent(along: Float[np.ndarray, " n"]) -> float:
+    return float(np.ptp(np.percentile(along, [0.5, 99.5])))
+
+
+def is_open_above(radius: Float[np.ndarray, " rays"]) -> bool:
+    """Return whether what is not seen of a section lies above, and is most of what is above."""
+    turn = bin_angles(len(radius))
+    unseen, above = ~np.isfinite(radius), np.sin(turn) > 0.7
+    return bool(unseen[above].mean() > _OPEN and (np.sin(turn[unseen]) > 0).mean() > _OPEN)

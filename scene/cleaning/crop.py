@@ -7,11 +7,11 @@ import numpy as np
 import tyro
 from jaxtyping import Float
 
-from scene.bore import Axis, make_axis
 from scene.cleaning.removed import Cleaned, part_of_cloud
 from scene.cloud import Cloud
 from scene.errors import FitError
 from scene.fitting.section import DENSE_STEP, OVERRUN, visible_span
+from scene.geometry import Axis, make_axis
 
 _FLAG = tyro.conf.arg(prefix_name=False)
 _AXIS_STEP = 1.0  # m
@@ -101,18 +101,10 @@ def turn_round(cleaned: Cleaned) -> Cleaned:
 
 
 def keep_stations(cleaned: Cleaned, everything: Cloud, config: ExtentConfig) -> tuple[Cleaned, Cloud, float]:
-    """Keep what lies between two stations.
+    """Keep what lies between two stations, counted from the first one that enough was seen of, as the whole build does.
 
-    Args:
-        cleaned: The bore's returns and its axis.
-        everything: The cloud before cleaning.
-        config: Stations from the first one that enough was seen of, as the whole build counts them.
-
-    Returns:
-        Both clouds, cut, and the station of the whole build at which the rest begins, m.
-
-    Raises:
-        FitError: The stations leave less than 5 m, a portal is not at the tunnel, or both are told.
+    Returns both clouds, cut, and the station of the whole build at which the rest begins, m. Raises `FitError` where
+    the stations leave less than 5 m, a portal is not at the tunnel, or both are told.
     """
     if config.first is None and config.last is None and config.portals is None:
         return cleaned, everything, 0.0
@@ -150,10 +142,8 @@ def _part_of_axis(axis: Axis, low: float, high: float) -> Axis:
 def describe_chainage(config: ExtentConfig, first: float, grows: str) -> dict[str, Any]:
     """Return the chainage of station 0, m, and the way it grows, for the manifest.
 
-    Args:
-        config: What the user says.
-        first: Station of the whole build at which this one begins, m.
-        grows: Way in which stations grow without `--reverse`, in words.
+    `first` is the station of the whole build at which this one begins, m; `grows` the way without `--reverse`, in
+    words.
     """
     way = f"against this, by --reverse: {grows}" if config.reverse else grows
     return {"chainage_start": config.start_chainage + first, "chainage_grows": way}

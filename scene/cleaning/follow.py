@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
 from scene.cleaning.seeds import N_RAYS, Seed, frame_of
+from scene.geometry import angle_bins, bin_angles, bin_medians
 
 STEP = 1.0  # m
 _HALF_SLAB = 0.75  # m
@@ -27,8 +28,7 @@ _PULL = 3.0  # bins that the prediction counts for
 _MIN_RETURNS = 12  # in a slab; fewer are a gap
 _ROUNDS = 3
 _AROUND = 10  # sections on each side of unsteady ones that tell where they are
-_LEVEL = 0.9  # cosine of the directions that count as left and right
-_TURN = -np.pi + 2 * np.pi * (np.arange(N_RAYS) + 0.5) / N_RAYS
+_TURN = bin_angles(N_RAYS)
 
 
 @dataclass(frozen=True)
@@ -56,9 +56,8 @@ class Course:
 
     @property
     def width(self) -> float:
-        """Distance of the walls to the left and right of the middle from each other, m."""
-        side = np.abs(np.cos(_TURN)) > _LEVEL
-        return 2 * float(np.mean(self.usual[side]))
+        """Extent across, from left to right, m."""
+        return float(np.ptp(self.usual * np.cos(_TURN)))
 
 
 def follow_bore(points: Float[np.ndarray, "n 3"], tree: cKDTree, seed: Seed) -> Course:
@@ -213,30 +212,20 @@ def _lay(
 
 def _polar(place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     turn = np.arctan2(place[:, 1], place[:, 0])
-    return np.floor((turn + np.pi) / (2 * np.pi) * N_RAYS).astype(np.intp) % N_RAYS, np.hypot(*place.T)
+    return angle_bins(turn, N_RAYS), np.hypot(*place.T)
 
 
 def _bin_off(bins: np.ndarray, off: np.ndarray) -> np.ndarray:
     """Median distance from the template of what is near it in each direction, m; NaN where nothing is."""
     near = np.abs(off) < _GATE
-    return _medians(bins[near], off[near])
+    return bin_medians(bins[near], off[near], N_RAYS)
 
 
 def _section(bins: np.ndarray, radius: np.ndarray, template: np.ndarray) -> np.ndarray:
     """Radius in each direction: of what is near the template, else of all that is there, else the template's."""
     near = np.abs(radius - template[bins]) < _GATE
-    best, any_ = _medians(bins[near], radius[near]), _medians(bins, radius)
+    best, any_ = bin_medians(bins[near], radius[near], N_RAYS), bin_medians(bins, radius, N_RAYS)
     return np.where(np.isfinite(best), best, np.where(np.isfinite(any_), any_, template))
-
-
-def _medians(bins: np.ndarray, value: np.ndarray) -> np.ndarray:
-    order = np.lexsort((value, bins))
-    bounds = np.searchsorted(bins[order], np.arange(N_RAYS + 1))
-    count = np.diff(bounds)
-    result = np.full(N_RAYS, np.nan)
-    some = count > 0
-    result[some] = value[order][bounds[:-1][some] + count[some] // 2]
-    return result
 
 
 def _normals(radius: np.ndarray) -> np.ndarray:

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from scene.bore import Axis
 from scene.cloud import Cloud
+from scene.geometry import Axis
 
 
 class Cause(IntEnum):
@@ -39,6 +39,7 @@ _WORDS = (
 )
 OUTSIDE = (Cause.BEYOND, Cause.BRANCH, Cause.ELSEWHERE)  # of the bore: no model of it need explain them
 
+_ROOT = 20  # percent of a branch's points, those nearest the bore, that are its mouth
 _BRANCH = 3.0  # m behind the wall: less is a niche
 _BUILDING = 2000  # points
 _MOUTH = 1.2  # m behind the wall: nearer returns of a branch are those of its mouth
@@ -57,7 +58,7 @@ class Removed:
     end: float  # Last station, m
     cause: Cause
     points: int  # Points of the thinned cloud in it
-    place: tuple[float, float, float]  # Median position in the input's frame, m
+    place: tuple[float, float, float]  # Its middle, of a branch that of its mouth, in the input's frame, m
     nearest: float = 0.0  # How far behind the wall it begins, m
     deepest: float = 0.0  # How far behind the wall it ends, m
     mouths: tuple[tuple[float, float], ...] = ()  # First and last stations at which a branch opens into the bore, m
@@ -131,23 +132,22 @@ def list_removed(
         rows = np.flatnonzero(cause == index)
         rows = rows[np.argsort(station[rows], kind="stable")]
         for part in np.split(rows, np.flatnonzero(np.diff(station[rows]) > gap) + 1):
-            x, y, z = np.median(cloud.points[part].astype(np.float64), axis=0) + cloud.origin
+            named, depth = part, np.zeros(2)
+            mouths: tuple[tuple[float, float], ...] = ()
+            if behind is not None:
+                depth = np.percentile(behind[part], [1, 99])
+                if index == Cause.BRANCH:  # one goes to its mouth to look, and not to the middle of what was cut
+                    named = part[behind[part] <= np.percentile(behind[part], _ROOT)]
+                    mouths = _find_mouths(station[part], behind[part])
+            x, y, z = (float(v) for v in np.median(cloud.points[named].astype(np.float64), axis=0) + cloud.origin)
             first, last = (float(station[part[end]]) for end in (0, -1))
-            depth = (0.0, 0.0) if behind is None else np.percentile(behind[part], [1, 99])
-            place = (float(x), float(y), float(z))
-            mouths = _find_mouths(station[part], behind[part]) if behind is not None and index == Cause.BRANCH else ()
             depths = float(depth[0]), float(depth[1])
-            result.append(Removed(first, last, Cause(index), len(part), place, *depths, mouths))
+            result.append(Removed(first, last, Cause(index), len(part), (x, y, z), *depths, mouths))
     return tuple(sorted(result, key=lambda part: (part.start, part.cause)))
 
 
 def _find_mouths(station: Float[np.ndarray, " n"], behind: Float[np.ndarray, " n"]) -> tuple[tuple[float, float], ...]:
-    """Return first and last stations of the stretches in which a branch comes near the wall, m.
-
-    Args:
-        station: Stations of its points in growing order, m.
-        behind: Distance of each behind the wall, m.
-    """
+    """Return first and last stations, which grow, of the stretches in which a branch comes near the wall, m."""
     near = station[behind < _MOUTH]
     parts = np.split(near, np.flatnonzero(np.diff(near) > _MOUTHS_APART) + 1)
     return tuple((float(part[0]), float(part[-1])) for part in parts if len(part) >= _MOUTH_POINTS)

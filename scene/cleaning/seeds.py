@@ -12,6 +12,7 @@ from scipy.ndimage import binary_dilation, distance_transform_edt
 from scipy.spatial import cKDTree
 
 from scene.cloud import occupied_cells
+from scene.geometry import bin_angles
 
 _TILE = 6.0  # m between places tried
 _MOST = 60  # places
@@ -36,6 +37,12 @@ class Seed:
     radius: Float[np.ndarray, " rays"]  # Distance to the first return around, m; NaN where there is none
     enclosed: float  # Share of the directions around in which there is a return
     score: float  # Share of the returns seen from here, times the square of `enclosed`
+
+    @property
+    def width(self) -> float:
+        """Extent across, from left to right, m."""
+        across = (self.radius * np.cos(bin_angles(N_RAYS)))[np.isfinite(self.radius)]
+        return float(np.ptp(across))
 
 
 def frame_of(direction: Float[np.ndarray, "3"]) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
@@ -89,7 +96,7 @@ def _seeds_at(near: np.ndarray) -> list[Seed]:
         if enclosed < 0.5:
             continue
         place = low + (np.array(at) + 0.5) * _CELL
-        turn = _ray_angles()
+        turn = bin_angles(N_RAYS)
         shift = _centroid(turn, radius)
         moved = np.array(at) + shift / _CELL
         inside = np.clip(np.rint(moved).astype(int), 0, np.array(solid.shape) - 1)
@@ -126,13 +133,9 @@ def sweep_direction(near: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
     return direction / np.linalg.norm(direction)
 
 
-def _ray_angles() -> np.ndarray:
-    return -np.pi + 2 * np.pi * (np.arange(N_RAYS) + 0.5) / N_RAYS
-
-
 def _cast(solid: np.ndarray, count: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, int]:
     """Distance to the first solid cell in each direction, m, NaN without one, and the returns in the cells seen."""
-    turn = _ray_angles()
+    turn = bin_angles(N_RAYS)
     steps = np.arange(1, int(_FURTHEST / _CELL * 2)) / 2
     where = at + steps[:, None, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)
     cell = np.rint(where).astype(int)

@@ -9,9 +9,9 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from scene.bore import Axis
 from scene.cleaning.removed import Cause
 from scene.cleaning.tube import Tube
+from scene.geometry import Axis, angle_bins
 
 _OVERRUN = 60.0  # m beyond the axis that points have stations
 _BEHIND = 0.45  # m behind the wall: further is no recess of a lining
@@ -69,7 +69,7 @@ def end_stations(tube: Tube, around: Around) -> tuple[float, float]:
         return first, last
     angle, radius = around.angle, around.radius
     out, _ = tube.off(around.station, angle, radius)
-    column = np.floor((angle + np.pi) / (2 * np.pi) * tube.grid.columns).astype(np.intp) % tube.grid.columns
+    column = angle_bins(angle, tube.grid.columns)
     on = (out < _BEHIND) & decide[column]
 
     def outermost(end: float, way: int) -> float:

@@ -19,9 +19,8 @@ from scipy.ndimage import (
     uniform_filter1d,
 )
 
-from scene.cleaning.hanging import bridge_hanging
-from scene.fitting.gaps import fill_sides
-from scene.fitting.unroll import Grid, fill_nearest
+from scene.fitting.unroll import Grid, fill_nearest, fill_sides
+from scene.geometry import bin_angles
 
 ROW = 0.5  # m
 _OVERRUN = 4.0  # m beyond the axis that may still be bore
@@ -83,7 +82,7 @@ def measure_tube(
     """
     grid = Grid.over(-_OVERRUN, length + _OVERRUN, ROW, COLUMNS)
     cell = grid.cell(station, angle)
-    rays = -np.pi + 2 * np.pi * (np.arange(len(reach)) + 0.5) / len(reach)
+    rays = bin_angles(len(reach))
     good = (cell >= 0) & (radius < np.interp(angle, rays, reach, period=2 * np.pi))
     bins = int(np.ceil(reach.max() / _BIN)) + 1
     flat = np.zeros((grid.rows * COLUMNS, bins), bool)
@@ -119,12 +118,7 @@ def _mirrored(
 ) -> Bool[np.ndarray, "rows cols bins"]:
     """Places below an unbroken floor with far fewer returns than it: water shows there what is above it.
 
-    Args:
-        grid: Stations and directions.
-        cell: Cell of each point.
-        index: Bin of each point's radius.
-        returns: Returns that each point stands for.
-        hit: Bins of each cell that hold a point.
+    `hit` are the bins of each cell that hold a point; of each point `cell`, `index` (bin) and `returns` are given.
     """
     result = np.zeros_like(hit)
     bins = hit.shape[2]
@@ -218,3 +212,55 @@ def _attached(narrower: np.ndarray, present: np.ndarray, wall: np.ndarray) -> Bo
         if min(edges) < _JUMP:
             result[row, column % columns] = True
     return result & narrower
+
+
+# Pipes, trays and ducts that hang free under a ceiling all along hide it in some directions, and are no wall: a wall
+# goes on to both sides. Where a section comes nearer at once and as suddenly goes back, and what is between lies inside
+# the straight line from one edge to the other, it is a thing in the bore, however long it is.
+_OVERHEAD = 0.35  # sine of the lowest direction: what stands on the floor or leans on a wall is told elsewhere
+_EDGE = 0.4  # m at both edges
+_WITHIN_LINE = 0.3  # m within the line between them
+_WIDEST_HANGING = np.deg2rad(60.0)
+
+
+def bridge_hanging(
+    radius: Float[np.ndarray, "rows cols"], angle: Float[np.ndarray, " cols"]
+) -> Float[np.ndarray, "rows cols"]:
+    """Return sections, m, nowhere NaN, with the straight line of the ceiling in place of what hangs under it.
+
+    Directions grow, rad.
+    """
+    over = np.flatnonzero(np.sin(angle) > _OVERHEAD)
+    result = radius.copy()
+    widest = int(_WIDEST_HANGING / (angle[1] - angle[0]))
+    step = np.diff(radius[:, over], axis=1)
+    nearer, farther = step < -_EDGE, step > _EDGE
+    for row in np.flatnonzero(nearer.any(axis=1) & farther.any(axis=1)):
+        lefts, rights = np.flatnonzero(nearer[row]), np.flatnonzero(farther[row]) + 1
+        result[row, over] = _bridge_section(radius[row, over], angle[over], lefts, rights, widest)
+    return result
+
+
+def _bridge_section(
+    section: Float[np.ndarray, " k"], angle: Float[np.ndarray, " k"], lefts: np.ndarray, rights: np.ndarray, widest: int
+) -> Float[np.ndarray, " k"]:
+    """Return the overhead part of a section, m, with a line over each thing that hangs in it.
+
+    It lies between a place before a jump towards the axis and one after a jump away, at most `widest` places apart.
+    """
+    section, beyond = section.copy(), 0
+    for left in lefts:
+        if left < beyond:
+            continue  # inside the thing before
+        for right in rights[(rights > left + 1) & (rights <= left + 1 + widest)]:
+            inside = np.arange(left + 1, right)
+            line = _line(section[left], section[right], angle[inside] - angle[left], angle[right] - angle[left])
+            if (section[inside] < line - _WITHIN_LINE).all():
+                section[inside], beyond = line, int(right)
+                break
+    return section
+
+
+def _line(first: float, last: float, turn: Float[np.ndarray, " k"], whole: float) -> Float[np.ndarray, " k"]:
+    """Distances to the straight line between two places, by the turn from the first one, rad."""
+    return first * last * np.sin(whole) / (first * np.sin(turn) + last * np.sin(whole - turn))

@@ -13,16 +13,16 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Shaped
+from jaxtyping import Float, Shaped
 from scipy.optimize import least_squares
 
-from scene.bore import POCKET, STRETCH, Axis, Bore, uniform_stations
+from scene.bore import POCKET, STRETCH, Bore, uniform_stations
 from scene.cloud import Cloud
-from scene.fitting.branches import require_no_room
+from scene.errors import FitError, Refusal
 from scene.fitting.centreline import smooth_axis
-from scene.fitting.profile import measure_section
 from scene.fitting.section import Sections, fit_sections
 from scene.fitting.unroll import probability_known
+from scene.geometry import Axis, measure_section
 
 _WINDOW = 2.0  # m of bore that one fit is made to
 _PIECE = 0.5  # m of girth that vary for themselves: so many parameters has a free profile
@@ -219,3 +219,24 @@ def _describe_stretch(stretch: np.void) -> dict[str, Any]:
     """One stretch for the manifest; a straight wall has no radius."""
     values = {name: stretch[name].item() for name in stretch.dtype.names or ()}
     return {name: value for name, value in values.items() if isinstance(value, str) or np.isfinite(value)}
+
+
+_PORTAL = 6.0  # m from an end within which a bore may flare open
+_ROOM, _ROOM_LENGTH = 2.0, 5.0  # times the median width; m, longer than a niche
+
+
+def require_no_room(station: Float[np.ndarray, " n"], width: Float[np.ndarray, " n"]) -> None:
+    """Refuses a bore that is twice as wide as usual over more than 5 m; raises `FitError`.
+
+    Stations are uniform, m. What widens within 6 m of an end is a portal.
+    """
+    usual = float(np.median(width))
+    wide = (width > _ROOM * usual) & (station > _PORTAL) & (station < station[-1] - _PORTAL)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], wide.astype(int), [0]])))
+    for first, last in zip(edges[::2], edges[1::2] - 1, strict=True):
+        if station[last] - station[first] > _ROOM_LENGTH:
+            raise FitError(
+                f"from station {station[first]:.0f} to {station[last]:.0f} m the bore is "
+                f"{width[first : last + 1].max():.0f} m wide where it is {usual:.1f} m elsewhere: a room, not a tunnel",
+                Refusal.ROOM,
+            )

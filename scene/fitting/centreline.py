@@ -10,14 +10,13 @@ import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import make_lsq_spline
 
-from scene.bore import Axis, axis_through
-from scene.errors import FitError
+from scene.errors import FitError, Refusal
 from scene.fitting.floorline import fit_floor_line, floor_radius
-from scene.fitting.profile import measure_section, section_angles
+from scene.geometry import Axis, angle_bins, arc_length, axis_through, bin_medians, measure_section, section_angles
 
 _OVERRUN = 6.0
 _THIN_SHARE, _THIN = 0.05, 20  # of the usual number of points, and points: a section that is hardly seen has fewer
-_UNUSUAL = 0.3  # m from the usual section
+_UNUSUAL, _ROUGH = 0.3, 6.0  # m from the usual section, and standard deviations of the wall about it
 _SPACING = 1.0
 _PASSES = 4
 _COARSE_ANGLES = 72
@@ -50,7 +49,8 @@ def centre_axis(
     for _ in range(_PASSES):
         axis = smooth_axis(section_middles(sample, axis, usual), config.cutoff)
     if axis.length < config.min_length:
-        raise FitError(f"the tunnel is {axis.length:.1f} m long; at least {config.min_length:g} m are needed")
+        why = f"the tunnel is {axis.length:.1f} m long; at least {config.min_length:g} m are needed"
+        raise FitError(why, Refusal.SHORT)
     return axis
 
 
@@ -60,13 +60,13 @@ def section_middles(
     """Return the middle of each section seen well enough, one a metre.
 
     `usual` returns the usual radii at stations of an axis. They stand in for directions in which nothing was seen, or
-    something 30 cm off: a niche, a lay-by, a flare.
+    something 30 cm off (on rough walls further): a niche, a lay-by, a flare.
     """
     extended = axis.at(np.arange(-_OVERRUN, axis.length + _OVERRUN, _SPACING))
     station, lateral, upward = extended.local(points)
     index = np.rint((station - extended.station[0]) / _SPACING).astype(np.intp)
     angle, radius = np.arctan2(upward, lateral), np.hypot(lateral, upward)
-    bins = np.floor((angle + np.pi) / (2 * np.pi) * _COARSE_ANGLES).astype(np.intp) % _COARSE_ANGLES
+    bins = angle_bins(angle, _COARSE_ANGLES)
     centres = section_angles(_COARSE_ANGLES) + np.pi / _COARSE_ANGLES
     order = np.argsort(index, kind="stable")
     bounds = np.searchsorted(index[order], np.arange(len(extended.station) + 1))
@@ -74,14 +74,18 @@ def section_middles(
     # Far from the last tripod a bore is thin, but goes on.
     enough = np.flatnonzero(count >= max(_THIN_SHARE * float(np.median(count[count > 0])), _THIN))
     if not len(enough):
-        raise FitError("no tunnel in the cloud: none of its returns lies on the wall of the way that was followed")
-    stand_in = usual(extended)
+        why = "no tunnel in the cloud: none of its returns lies on the wall of the way that was followed"
+        raise FitError(why, Refusal.NO_BORE)
+    sections = [order[bounds[k] : bounds[k + 1]] for k in range(enough[0], enough[-1] + 1)]
+    seen_wall = np.array([bin_medians(bins[rows], radius[rows], _COARSE_ANGLES) for rows in sections])
+    stand_in = usual(extended)[enough[0] : enough[-1] + 1]
+    off = np.abs(seen_wall - stand_in)
+    # Where rough walls depart as far, what departs is wall: a stand-in for every bump would move the axis.
+    limit = max(_UNUSUAL, _ROUGH * 1.4826 * float(np.nanmedian(off)))
     middles, shown = [], []
-    for k in range(enough[0], enough[-1] + 1):
-        rows = order[bounds[k] : bounds[k + 1]]
-        medians = _bin_medians(bins[rows], radius[rows])
-        usual_here = np.abs(medians - stand_in[k]) < _UNUSUAL
-        around = np.where(usual_here, medians, stand_in[k])
+    for k, rows in enumerate(sections, enough[0]):
+        usual_here = off[k - enough[0]] < limit
+        around = np.where(usual_here, seen_wall[k - enough[0]], stand_in[k - enough[0]])
         if np.isfinite(around).mean() < _MIN_SEEN:
             continue
         shown.append(float(usual_here.mean()))
@@ -96,7 +100,7 @@ def section_middles(
         across, along = measure_section(centres, around).middle
         middles.append(extended.position[k] + across * extended.lateral[k] + along * extended.up[k])
     if len(middles) < 4:
-        raise FitError("no tunnel in the cloud: hardly a section shows most of its circumference")
+        raise FitError("no tunnel in the cloud: hardly a section shows most of its circumference", Refusal.UNSEEN)
     return np.asarray(middles)[_cut_begun(np.array(shown))]
 
 
@@ -116,22 +120,12 @@ def _cut_begun(shown: Float[np.ndarray, " k"]) -> slice:
     return slice(first, len(shown) - last)
 
 
-def _bin_medians(bins: np.ndarray, radius: np.ndarray) -> Float[np.ndarray, " m"]:
-    order = np.lexsort((radius, bins))
-    bounds = np.searchsorted(bins[order], np.arange(_COARSE_ANGLES + 1))
-    count = np.diff(bounds)
-    if not len(order):
-        return np.full(_COARSE_ANGLES, np.nan)
-    middle = np.minimum(bounds[:-1] + count // 2, len(order) - 1)
-    return np.where(count > 0, radius[order][middle], np.nan)
-
-
 def smooth_axis(centres: np.ndarray, cutoff: float) -> Axis:
     """Return a least-squares cubic spline by chord length with two knots per `cutoff`.
 
     A smoothing spline would straighten its ends, by 2 cm on an arc of 150 m; this one has no end condition.
     """
-    chord = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(centres, axis=0), axis=1))])
+    chord = arc_length(centres)
     pieces = min(max(round(2 * chord[-1] / cutoff), 1), len(chord) // 4)
     inner = np.linspace(0.0, chord[-1], max(pieces, 1) + 1)[1:-1]
     knots = np.concatenate([[0.0] * 4, inner, [chord[-1]] * 4])

@@ -55,13 +55,8 @@ def open_rims(
 ) -> Float[np.ndarray, " p"]:
     """Return the share of the wall that is missing around each hole: about 0 for a pocket, 1 for a shadow's part.
 
-    Args:
-        deficit: Share of the wall's returns that each cell lacks.
-        grid: Cells of the wall.
-        row: Middle of each hole, in cells.
-        column: The same around.
-        size: Length and width of a hole, m.
-        radius: Distance of the wall from the axis, m.
+    `deficit` is the share of the wall's returns that each cell lacks. The middle of a hole is given in cells, its
+    length and width, and the distance of the wall from the axis, `radius`, in m.
     """
     smooth = uniform_filter(deficit, (3, 3), mode=MODES)
     reach = (size[0] / 2 / grid.step, size[1] / 2 / (2 * np.pi * radius / grid.columns))
@@ -137,12 +132,8 @@ def odds_by_place(
     """Return the odds that each hole is a pocket, as a logarithm, with what holes at the same place in the rings are.
 
     A hole's odds before its own returns count are those of all holes within 5 cm along the rings, half a pocket and
-    half a wall beside them; they are found together with the odds of those (expectation and maximisation).
-
-    Args:
-        ratio: How much likelier the returns about each hole are with a pocket there, as a logarithm.
-        station: Stations of the holes, m.
-        pitch: Length of a ring, m.
+    half a wall beside them; they are found together with the odds of those (expectation and maximisation). `ratio` is
+    how much likelier the returns about each hole are with a pocket there, as a logarithm.
     """
     place = np.mod(station, pitch)
     order = np.argsort(place)
@@ -160,13 +151,9 @@ def odds_by_place(
 def more_than_chance(
     pocket: Shaped[np.ndarray, " p"], joints: Float[np.ndarray, " r"], pitches: tuple[float, float], radius: float
 ) -> bool:
-    """Return whether pockets stand at their joints in a way that random holes would not.
+    """Return whether pockets, of `scene.bore.POCKET`, stand at their joints, m, in a way that random holes would not.
 
-    Args:
-        pocket: Pockets, of `scene.bore.POCKET`.
-        joints: Ring joints fitted to them, m.
-        pitches: Least and largest pitch that was tried, m.
-        radius: Distance of the wall from the axis, m.
+    `pitches` are the least and largest that were tried, m; `radius` is the distance of the wall from the axis, m.
     """
     if len(joints) < 2 or not len(pocket):
         return False
@@ -186,11 +173,8 @@ def turned_more_than_chance(
 ) -> bool:
     """Return whether holes stand at the same places of every ring in a way that random holes would not.
 
-    Args:
-        station: Stations of all clear holes of the wall, m, whether at such a place or not.
-        ring: Pitch and places fitted to them.
-        length: Length of the bore, m.
-        pitches: Least and largest pitch that was tried, m.
+    `station` are those of all clear holes, m, whether at such a place or not; `ring` is fitted to them, between the
+    least and largest of `pitches`, m.
     """
     each = one_a_bin(station)
     tried = max(N_HARMONICS * length * (1 / pitches[0] - 1 / pitches[1]), 1.0)
@@ -207,8 +191,7 @@ def turned_more_than_chance(
 def steadier_than_chance(gaps: Float[np.ndarray, " g"]) -> bool:
     """Return whether more gaps between sleepers are alike than between things that lie at random.
 
-    Args:
-        gaps: Distances of neighbours, m; where one was not seen, the gap is double.
+    Gaps are distances of neighbours, m; where one was not seen, the gap is double.
     """
     if not len(gaps):
         return False

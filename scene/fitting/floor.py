@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import binary_opening, gaussian_filter1d, median_filter
 
-from scene.bore import Axis
 from scene.fitting.floorline import find_lower_line, fit_floor_line
 from scene.fitting.unroll import Grid
+from scene.geometry import Axis
 
 _FLOOR_STEP = 0.5  # m
 _FLOOR_SIGMA = 1.0  # m

@@ -100,18 +100,12 @@ def find_lower_line(
 
 @dataclass(frozen=True)
 class _Layer:
-    """A layer of returns that may be the floor of a section.
+    """A layer of returns that may be the floor of a section."""
 
-    Attributes:
-        worth: Score among the layers of all slopes; 0 where it is no floor.
-        line: Height at the axis (m) and slope.
-        extent: Share of the strips whose lowest returns lie in it.
-        bottoms: Height of each strip's lowest returns above it, m; `inf` where a strip shows nothing.
-    """
-
-    worth: float
-    line: tuple[float, float]
-    extent: float
+    worth: float  # Score among the layers of all slopes; 0 where it is no floor.
+    line: tuple[float, float]  # Height at the axis (m) and slope.
+    extent: float  # Share of the strips whose lowest returns lie in it.
+    # Height of each strip's lowest returns above it, m; `inf` where a strip shows nothing.
     bottoms: Float[np.ndarray, " strips"]
 
 

@@ -26,10 +26,7 @@ def find_joints_by_steps(
 ) -> Float[np.ndarray, " r"]:
     """Finds the stations of the ring joints from the start of the grid, m; empty where steps do not tell them.
 
-    Args:
-        sections: The wall.
-        hole: Cells of pockets and other holes, whose rims would be steps.
-        pitch: Length of a ring, m.
+    `hole` are cells of pockets and other holes, whose rims would be steps; `pitch` is the length of a ring, m.
     """
     grid = sections.grid
     station, step = _mean_square_steps(sections, ~hole)

@@ -112,7 +112,7 @@ def _count_returns(
     """For each pocket: points where a nail would hang, their median depth, m, and points further back."""
     pocket, axis = bore.pocket, bore.axis
     at = axis.at(pocket["station"])
-    row = np.clip(np.rint(pocket["station"] / bore.station[1]).astype(np.intp), 0, len(bore.station) - 1)
+    row = bore.row_of(pocket["station"])
     radius = np.array([
         np.interp(a, bore.angle, bore.radius[k], period=2 * np.pi) for a, k in zip(pocket["angle"], row, strict=True)
     ])  # fmt: skip

@@ -253,12 +253,7 @@ def _gauges(
 ) -> Float[np.ndarray, " k"]:
     """Measures the gauge of each piece of track that shows both inner faces, m.
 
-    Args:
-        across: Distance of each return to the left of the track's middle, m.
-        below: For each side, height above the head's top, m.
-        near: For each side, the returns near its rail.
-        pieces: Piece of track that each return lies in.
-        face: Layer below the heads' tops that shows their inner faces, m.
+    `across` is to the left of the track's middle; `below`, height above the head's top, and `near` are given by side.
     """
     gauges = np.zeros(int(pieces.max()) + 1)
     for piece in range(len(gauges)):

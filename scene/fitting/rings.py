@@ -8,13 +8,13 @@ from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 
-from scene.bore import POCKET, STATION_STEP, STRETCH, Bore, axis_through, make_axis
+from scene.bore import POCKET, STATION_STEP, STRETCH, Bore
 from scene.errors import FitError
 from scene.fitting.assemble import describe_bore
 from scene.fitting.lining import LiningConfig, add_standard_lining
-from scene.fitting.profile import section_angles
 from scene.fitting.universal import joints_by_number
 from scene.fitting.unroll import UNSEEN_GROWTH, probability_known
+from scene.geometry import arc_length, axis_through, make_axis, section_angles
 from scene.reading.ringsurvey import RingSurvey
 
 _MIN_POINTS = 5
@@ -110,7 +110,7 @@ def compare_with_design(fit: RingFit, design: Float[np.ndarray, "d 4"]) -> dict[
 
 
 def _tangents(centre: np.ndarray) -> np.ndarray:
-    chord = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(centre, axis=0), axis=1))])
+    chord = arc_length(centre)
     tangent = CubicSpline(chord, centre)(chord, 1)
     return tangent / np.linalg.norm(tangent, axis=1, keepdims=True)
 

@@ -12,15 +12,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import binary_opening, uniform_filter1d
 
-from scene.bore import Axis
 from scene.cloud import Cloud
-from scene.errors import FitError
+from scene.errors import FitError, Refusal
 from scene.fitting import unroll
 from scene.fitting.floor import Floors, clip_to_floor, extend_to_floor, find_floors, is_floor
-from scene.fitting.gaps import fill_sides
 from scene.fitting.kriging import krige_profiles
-from scene.fitting.profile import N_ANGLES
-from scene.fitting.unroll import Grid
+from scene.fitting.unroll import Grid, fill_sides
+from scene.geometry import N_ANGLES, Axis, angle_bins
 
 DENSE_STEP = 0.25  # m; where nearly every row of this length was seen, the survey is no row of profiles
 OVERRUN = 3.0  # m beyond the axis that are looked at
@@ -47,7 +45,7 @@ def visible_span(station: np.ndarray, angle: np.ndarray, axis: Axis) -> tuple[fl
     # Profiles apart, and aslant to the axis where the bore flares: the first and the last one are the ends.
     rows = np.flatnonzero((uniform_filter1d((count > 0).astype(float), 3, axis=0) > 0).mean(axis=1) > _END_COVERAGE)
     if not len(rows):
-        raise FitError("no tunnel in the cloud: hardly a section shows most of its circumference")
+        raise FitError("no tunnel in the cloud: hardly a section shows most of its circumference", Refusal.UNSEEN)
     first, last = (grid.start + (row + 0.5) * grid.step for row in (rows[0], rows[-1]))
     return _profile_station(station, first, 1), _profile_station(station, last, -1)
 
@@ -81,7 +79,7 @@ def _trim_aslant(station: np.ndarray, angle: np.ndarray, end: float) -> float:
     inwards, m.
     """
     near = (station > end - 1.0) & (station < end + 2.0)
-    column = np.floor((angle[near] + np.pi) / (2 * np.pi) * _MOUTH_COLUMNS).astype(np.intp) % _MOUTH_COLUMNS
+    column = angle_bins(angle[near], _MOUTH_COLUMNS)
     outermost = np.full(_MOUTH_COLUMNS, np.inf)
     np.minimum.at(outermost, column, station[near])
     seen = outermost[np.isfinite(outermost)]
@@ -101,7 +99,7 @@ def profile_spacing(station: np.ndarray, start: float, end: float) -> float:
         edges = np.arange(start, end, step)
         if _share_seen(np.histogram(inside, np.append(edges, end))[0] > 0, step) >= _MIN_ROWS_SEEN:
             return step
-    raise FitError(f"profiles more than {_STEPS[-1]:g} m apart leave the wall between them unknown")
+    raise FitError(f"profiles more than {_STEPS[-1]:g} m apart leave the wall between them unknown", Refusal.UNSEEN)
 
 
 def _share_seen(seen: np.ndarray, step: float) -> float:
@@ -203,7 +201,8 @@ def _share_of_cells(points: _Points, grid: Grid) -> float:
 def _first_wall(points: _Points, coarse: Grid, fine: Grid, floors: Floors | None) -> np.ndarray:
     wall = unroll.cell_medians(coarse, coarse.cell(points.station, points.angle), points.radius)
     if np.isfinite(wall).mean() < _MIN_COVERAGE:
-        raise FitError(f"only {np.isfinite(wall).mean():.0%} of the bore's surface was seen; at least half is needed")
+        why = f"only {np.isfinite(wall).mean():.0%} of the bore's surface was seen; at least half is needed"
+        raise FitError(why, Refusal.UNSEEN)
     wall = fill_sides(unroll.fill_holes(wall, _LARGE_HOLE), coarse.angle, round(_GOES_ON / coarse.step))
     window = (round(_MEDIAN_WINDOW[0] / coarse.step) // 2 * 2 + 1, _MEDIAN_WINDOW[1])
     along = unroll.median_smooth(unroll.fill_nearest(wall), (window[0], 1))
@@ -218,7 +217,8 @@ def _require_open_middle(points: _Points, fine: Grid, wall: np.ndarray) -> None:
     cell, outward = points.outward_of(wall, fine)
     hollow = np.mean(np.abs(outward[cell >= 0]) < _HOLLOW)
     if hollow < _MIN_HOLLOW:
-        raise FitError(f"no tunnel in the cloud: only {hollow:.0%} of its points lie on a wall around an open middle")
+        why = f"no tunnel in the cloud: only {hollow:.0%} of its points lie on a wall around an open middle"
+        raise FitError(why, Refusal.NO_BORE)
 
 
 def _follow_wall(

@@ -1,6 +1,9 @@
-"""The tracks that a cloud shows: their rails, and the sleepers that stand out of floor or ballast."""
+"""The tracks that a cloud shows: their rails, and the sleepers that stand out of floor or ballast.
 
-from dataclasses import dataclass
+The gauge is read off single returns: in a thinned cloud the mean of a voxel mixes the side of a head with its top.
+"""
+
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -8,7 +11,8 @@ from jaxtyping import Bool, Float
 from scene.bore import Bore
 from scene.cloud import Cloud
 from scene.fitting.evidence import steadier_than_chance
-from scene.fitting.rails import SeenRails, can_show_rails, find_rails
+from scene.fitting.rails import SeenRails, can_show_rails, find_rails, measure_again
+from scene.geometry import angle_bins
 
 _BIN = 0.01  # m along
 _SMOOTH = 0.09  # m, box; well below a sleeper's width
@@ -91,8 +95,8 @@ def above_floor(points: Float[np.ndarray, "n 3"], bore: Bore) -> tuple[np.ndarra
     low = (upward < 0) & (np.abs(lateral) < widest) & (station > 0) & (station < bore.length)
     station, lateral, upward = station[low], lateral[low], upward[low]
     angle, radius = np.arctan2(upward, lateral), np.hypot(lateral, upward)
-    row = np.clip(np.rint(station / (bore.station[1] - bore.station[0])).astype(np.intp), 0, len(bore.station) - 1)
-    column = np.floor((angle + np.pi) / (2 * np.pi) * len(bore.angle)).astype(np.intp) % len(bore.angle)
+    row = bore.row_of(station)
+    column = angle_bins(angle, len(bore.angle))
     lean = angle - bore.angle[column]
     floor = bore.radius[row, column] * np.sin(bore.angle[column]) / np.sin(bore.angle[column] + lean)
     return station, lateral, upward, (floor - radius) * -np.sin(angle)
@@ -190,3 +194,34 @@ def _complete_sleepers(centre: np.ndarray, spacing: float, length: float) -> tup
         places.append(places[-1] + spacing)
         measured.append(False)
     return np.array(places), np.array(measured)
+
+
+_TALLEST = 0.8  # m above the floor
+_BESIDE = 0.10  # m to each side of the middle of a rail
+_CHUNK = 500_000  # points; bounds the memory
+
+
+def measure_gauge(seen: SeenTrack, low: Float[np.ndarray, "n 3"], bore: Bore) -> SeenTrack:
+    """Measures the gauge of each track anew by single returns; what they do not show sharply stays.
+
+    `low` are single returns below the LiDAR, in the tunnel frame, m; none of a cloud that came registered.
+    """
+    if not seen.shows_rails or not len(low):
+        return seen
+    parts = [_beside_rails(low[k : k + _CHUNK], bore, seen.lines) for k in range(0, len(low), _CHUNK)]
+    near = np.concatenate(parts)
+    lines = (SeenLine(one.sleepers, measure_again(one.rails, *near.T), one.bed) if one.rails else one
+             for one in seen.lines)  # fmt: skip
+    return replace(seen, lines=tuple(lines))
+
+
+def _beside_rails(
+    points: Float[np.ndarray, "n 3"], bore: Bore, lines: tuple[SeenLine, ...]
+) -> Float[np.ndarray, "k 4"]:
+    """Return station, offset, height above the floor and above the axis of the points near any rail, m."""
+    station, lateral, upward, height = above_floor(points, bore)
+    near = np.zeros(len(station), bool)
+    for rails in (line.rails for line in lines if line.rails is not None):
+        near |= np.abs(np.abs(lateral - rails.offset_at(station)) - rails.apart / 2) < _BESIDE
+    near &= np.abs(height) < _TALLEST
+    return np.column_stack([station, lateral, height, upward])[near]

@@ -47,10 +47,7 @@ class Ring:
 def find_ring(station: Float[np.ndarray, " p"], length: float, pitches: tuple[float, float]) -> Ring:
     """Finds the pitch, and the places in a ring, that holes agree on best; whether they do is for others to say.
 
-    Args:
-        station: Stations of the holes, m; at least one.
-        length: Length of the bore, m.
-        pitches: Least and largest pitch, m.
+    Takes the stations of at least one hole, the length of the bore, and the least and largest pitch, m.
     """
     pitch = _find_pitch(station, length, pitches)
     bins = max(round(pitch / _FOLD), 8)

@@ -24,15 +24,8 @@ _FEW = 4
 def joints_by_number(names: list[str], station: Float[np.ndarray, " r"]) -> Float[np.ndarray, " j"]:
     """Return the ring joints of a survey of some rings, m: between two that were measured, rings are of one length.
 
-    A ring is taken as measured at its middle.
-
-    Args:
-        names: Names of the rings measured; only whole numbers that grow, or fall, along the tunnel tell the rings
-            between.
-        station: Their stations, m.
-
-    Returns:
-        All joints between the first and the last of them; none where the names tell nothing.
+    A ring is taken as measured at its middle. Only names that are whole numbers and grow, or fall, along the tunnel
+    tell the rings between: all joints between the first and the last of them, none where the names tell nothing.
     """
     if len(names) < _FEW or not all(name.isdecimal() for name in names):
         return np.empty(0)
@@ -52,13 +45,9 @@ def draw_places(rng: np.random.Generator, count: int) -> Int[np.ndarray, " r"]:
 
 
 def radial_joints(seed: int, count: int) -> Float[np.ndarray, "r 6"]:
-    """Return the angles of the radial joints of each ring, rad.
+    """Return the angles of the radial joints of `count` rings, rad.
 
     The first bolt of the tunnel is drawn too, since nobody says where its designer has put it.
-
-    Args:
-        seed: Seed of the draws.
-        count: Number of rings.
     """
     rng = np.random.default_rng(seed)
     begin = rng.uniform(0.0, PLACE)
@@ -68,12 +57,9 @@ def radial_joints(seed: int, count: int) -> Float[np.ndarray, "r 6"]:
 def place_pockets(
     joint: Float[np.ndarray, " j"], seed: int, offset: float
 ) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
-    """Return station, m, and angle, rad, of the pockets at the radial joints of all whole rings.
+    """Return station, m, and angle, rad, of the pockets at the radial joints of all whole rings between joints, m.
 
-    Args:
-        joint: Stations of the ring joints, m.
-        seed: Seed of the turns.
-        offset: Angle from a radial joint to the middle of a pocket, rad.
+    `offset` is the angle from a radial joint to the middle of a pocket, rad.
     """
     middle = 0.5 * (joint[1:] + joint[:-1])
     angle = radial_joints(seed, len(middle))[..., None] + offset * np.array([-1.0, 1.0])

@@ -1,4 +1,4 @@
-"""The wall rolled out flat: a grid over station and angle, and the standard deviation of the wall in each cell."""
+"""The wall rolled out flat: a grid over station and angle, what no scanner saw of it, and how sure each cell is."""
 
 from dataclasses import dataclass
 
@@ -6,6 +6,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filter, label, median_filter
 from scipy.special import erf
+
+from scene.geometry import angle_bins, bin_angles
 
 _RADIUS_STEP = 1.0 / (1 << 14)  # 0.06 mm, so that a cell and a radius fit one sortable word
 _RADIUS_BITS = 20
@@ -33,12 +35,12 @@ class Grid:
     @property
     def angle(self) -> Float[np.ndarray, " columns"]:
         """Middle of each column, rad in [-π, π)."""
-        return -np.pi + 2 * np.pi * (np.arange(self.columns) + 0.5) / self.columns
+        return bin_angles(self.columns)
 
     def cell(self, station: Float[np.ndarray, " p"], angle: Float[np.ndarray, " p"]) -> Int[np.ndarray, " p"]:
         """Return the flat index of each point's cell; -1 outside the rows."""
         row = np.floor((station - self.start) / self.step).astype(np.int64)
-        column = np.floor((angle + np.pi) / (2 * np.pi) * self.columns).astype(np.int64) % self.columns
+        column = angle_bins(angle, self.columns)
         return np.where((row >= 0) & (row < self.rows), row * self.columns + column, -1)
 
 
@@ -183,3 +185,52 @@ def _wall_change(wall: np.ndarray, seen: np.ndarray, rows: int) -> float:
 def probability_known(sigma: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     """Return the probability that an error of standard deviation `sigma`, m, is below 5 cm."""
     return erf(TOLERANCE / np.maximum(sigma, 1e-9) / np.sqrt(2))
+
+
+_WIDEST_GAP = np.deg2rad(120.0)  # a wider gap has no two ends that a line could join
+_LEAST_GAP = np.deg2rad(15.0)  # narrower ones are filled from their neighbours as well as by any line
+# |cos| of the middle of a gap: those of walls; a crown is round, and a floor lower than what was seen
+_SIDE_OF_WALL = 0.7
+
+
+def fill_sides(
+    radius: Float[np.ndarray, "rows cols"], angle: Float[np.ndarray, " cols"], reach: int = 0
+) -> Float[np.ndarray, "rows cols"]:
+    """Fills wide gaps of NaN in sections: at an end from the row before, and else walls by the line between their ends.
+
+    The nearest thing seen below a wall is the corner of the floor, half as far again from the axis as the wall is: a
+    wall filled from it would stand aside by most of a metre. The line between floor and crown cuts a wall off that
+    nobody saw down to its foot, by half a metre: where a scan ends aslant, the wall goes on as it was.
+
+    Args:
+        radius: Distance of the wall from the axis, m; NaN where nothing was seen. Other gaps stay NaN.
+        angle: Directions from the axis, evenly all around, rad.
+        reach: Rows that a wall goes on as it was, where its direction is unseen from there to the end of the bore.
+    """
+    result, count = radius.copy(), len(angle)
+    step = 2 * np.pi / count
+    last = _last_rows(np.isfinite(radius), reach)
+    for row in np.flatnonzero(np.isnan(radius).any(axis=1) & np.isfinite(radius).any(axis=1)):
+        seen = np.flatnonzero(np.isfinite(radius[row]))
+        for before, behind in zip(seen, np.append(seen[1:], seen[0] + count), strict=True):
+            width = (behind - before) * step
+            inside = np.arange(before + 1, behind)
+            if width <= _LEAST_GAP:
+                continue
+            columns = inside % count
+            result[row, columns] = radius[last[row, columns], columns]
+            inside = inside[np.isnan(result[row, columns])]
+            if width >= _WIDEST_GAP or abs(np.cos(angle[before] + width / 2)) < _SIDE_OF_WALL:
+                continue
+            r0, r1 = radius[row, before], radius[row, behind % count]
+            turn = (inside - before) * step
+            result[row, inside % count] = r0 * r1 * np.sin(width) / (r0 * np.sin(turn) + r1 * np.sin(width - turn))
+    return result
+
+
+def _last_rows(seen: Bool[np.ndarray, "rows cols"], reach: int) -> Int[np.ndarray, "rows cols"]:
+    """Return the row that last showed each direction, where none follows and it is within `reach`; else its own."""
+    rows, count = np.arange(len(seen))[:, None], len(seen)
+    first, last = np.argmax(seen, axis=0), count - 1 - np.argmax(seen[::-1], axis=0)
+    last_seen = np.where(rows > last, last, np.where(rows < first, first, rows))
+    return np.where(seen.any(axis=0) & (np.abs(last_seen - rows) <= reach), last_seen, rows)

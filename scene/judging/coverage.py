@@ -9,15 +9,16 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from scene.bore import Bore
+from scene.geometry import angle_bins, bin_angles
+from scene.judging.codes import name_sides
 from scene.judging.returns import EXPLAINED, Returns
-from scene.judging.words import name_sides
 
 ROW = 1.0  # m
 SECTORS = 36
 _SPARSE = 0.03  # of the usual number of returns of a cell: with fewer it was not seen, as stray returns are everywhere
 _MIN_AREA = 3.0  # m² of wall in one piece: a smaller one is a shadow that its neighbours tell about
 _MIN_LENGTH, _MIN_GIRTH = 1.5, 0.9  # m
-_CENTRES = -np.pi + (np.arange(SECTORS) + 0.5) * 2 * np.pi / SECTORS
+_CENTRES = bin_angles(SECTORS)
 _FLOOR = np.deg2rad(35)
 
 
@@ -55,17 +56,14 @@ class Coverage:
 def find_unseen(bore: Bore, returns: Returns, spacing: float = 0.0) -> Coverage:
     """Finds the parts of a bore's wall on which hardly a return lies.
 
-    Args:
-        bore: The bore as built.
-        returns: All returns about it.
-        spacing: Distance of the survey's profiles, m; 0 for a dense survey.
+    `spacing` is the distance of the survey's profiles, m; 0 for a dense survey.
     """
     step = max(ROW, 2.5 * spacing)
     rows = max(round(bore.length / step), 1)
     edges = np.linspace(0.0, bore.length, rows + 1)
     on_wall = (returns.kind == EXPLAINED) & (returns.station >= 0) & (returns.station <= bore.length)
     row = np.minimum((returns.station[on_wall] / bore.length * rows).astype(np.intp), rows - 1)
-    column = np.floor((returns.angle[on_wall] + np.pi) / (2 * np.pi) * SECTORS).astype(np.intp) % SECTORS
+    column = angle_bins(returns.angle[on_wall], SECTORS)
     count = np.bincount(row * SECTORS + column, minlength=rows * SECTORS).reshape(rows, SECTORS)
     area = _cell_areas(bore, edges)
     density = count / area
@@ -83,7 +81,7 @@ _GOES_ON = 0.6  # of these directions
 def measure_overruns(bore: Bore, returns: Returns) -> tuple[float, float]:
     """Return how far the cloud shows a lining before the first and behind the last station of a bore, at least, m."""
     overhead = (np.sin(returns.angle) > _OVERHEAD) & (np.abs(returns.outward) < _ON_LINING)
-    column = np.floor((returns.angle + np.pi) / (2 * np.pi) * SECTORS).astype(np.intp) % SECTORS
+    column = angle_bins(returns.angle, SECTORS)
     all_columns = np.sin(_CENTRES) > _OVERHEAD
     result = []
     for beyond in (-returns.station, returns.station - bore.length):
@@ -99,10 +97,10 @@ def _cell_areas(bore: Bore, edges: np.ndarray) -> Float[np.ndarray, "r c"]:
     """Area of wall in each cell, m²."""
     y, z = bore.radius * np.cos(bore.angle), bore.radius * np.sin(bore.angle)
     girth = np.hypot(np.roll(y, -1, axis=1) - y, np.roll(z, -1, axis=1) - z)
-    column = np.floor((bore.angle + np.pi + 1e-9) / (2 * np.pi) * SECTORS).astype(np.intp) % SECTORS
+    column = angle_bins(bore.angle + 1e-9, SECTORS)
     around = np.stack([girth[:, column == k].sum(axis=1) for k in range(SECTORS)], axis=1)
-    middle = np.clip(np.rint((edges[1:] + edges[:-1]) / 2 / bore.station[1]).astype(np.intp), 0, len(bore.station) - 1)
-    return np.maximum(around[middle], 1e-3) * np.diff(edges)[:, None]
+    middle = (edges[1:] + edges[:-1]) / 2
+    return np.maximum(around[bore.row_of(middle)], 1e-3) * np.diff(edges)[:, None]
 
 
 def _list_pieces(seen: np.ndarray, area: np.ndarray, edges: np.ndarray) -> tuple[Unseen, ...]:

@@ -99,7 +99,7 @@ def draw_strips(judgement: Judgement, length: float) -> str:
 
 def draw_section(bore: Bore, returns: Returns, start: float, end: float) -> str:
     """Return the section in the middle of some stations, with the returns between them over it."""
-    row = int(np.clip(np.rint((start + end) / 2 / bore.station[1]), 0, len(bore.station) - 1))
+    row = int(bore.row_of((start + end) / 2))
     wall = np.stack([bore.radius[row] * np.cos(bore.angle), bore.radius[row] * np.sin(bore.angle)], axis=1)
     low, high = wall.min(axis=0) - _SEEN_AROUND, wall.max(axis=0) + _SEEN_AROUND
     size = 300
@@ -132,7 +132,7 @@ def _most(values: Iterable[np.ndarray]) -> float:
 
 
 def _plan_points(bore: Bore, returns: Returns, rows: np.ndarray) -> Float[np.ndarray, "k 2"]:
-    at = np.clip(np.rint(returns.station[rows] / bore.station[1]), 0, len(bore.station) - 1).astype(np.intp)
+    at = bore.row_of(returns.station[rows])
     along = returns.station[rows] - bore.station[at]
     return (
         bore.position[at, :2] + along[:, None] * bore.tangent[at, :2]

@@ -11,11 +11,10 @@ from scene.bore import Bore
 from scene.cleaning.removed import OUTSIDE, Cause, Removed
 from scene.cloud import Cloud
 from scene.errors import FitError
-from scene.judging.codes import Code
+from scene.judging.codes import Code, name_span
 from scene.judging.coverage import Coverage, find_unseen, measure_overruns
 from scene.judging.places import Place, find_places
 from scene.judging.returns import BEHIND, BEYOND, EXPLAINED, INSIDE, Returns, TrackZone, compare_returns
-from scene.judging.words import name_span
 
 _FLAG = tyro.conf.arg(prefix_name=False)
 _LISTED = 10  # places and worst stations that are listed
@@ -120,16 +119,10 @@ def judge_bore(
     removed: tuple[Removed, ...] = (),
     spacing: float = 0.0,
 ) -> Judgement:
-    """Judges a bore against every return of the registered cloud, before anything was cut from it.
+    """Judges a bore against every return of the registered cloud before cleaning, `everything`, in the bore's frame.
 
-    Args:
-        bore: The bore as built.
-        everything: The registered cloud before cleaning, in the bore's frame.
-        config: Limits.
-        track: Space of the track; `None` where none was laid.
-        cause: `Cause` of each point of `everything`, `(n,)`; `None` where nothing was cut.
-        removed: Stretches that were cut away.
-        spacing: Distance of the survey's profiles, m; 0 for a dense survey.
+    `cause` holds the `Cause` of each of its points, `(n,)`, `None` where nothing was cut; `track` is the space of the
+    track, `None` where none was laid; `spacing` the distance of the survey's profiles, m, 0 for a dense survey.
     """
     returns = compare_returns(bore, everything, config.tolerance, track)
     coverage = find_unseen(bore, returns, spacing)

@@ -6,9 +6,8 @@ from scipy.spatial import cKDTree
 
 from scene.bore import Bore
 from scene.cloud import Cloud
-from scene.judging.codes import Code
+from scene.judging.codes import Code, name_span
 from scene.judging.judge import Warned
-from scene.judging.words import name_span
 
 _PLACES = 1500  # of the wall that are looked at
 _REACH = 0.22  # m around a place
@@ -26,10 +25,9 @@ _WINDOW = 10.0  # m
 def doubt_layers(bore: Bore, cloud: Cloud) -> list[Warned]:
     """Warn of a wall that most places of some stretch show twice, a few centimetres apart."""
     station, lateral, upward = bore.axis.local(cloud.points.astype(np.float64))
-    row = np.clip(np.rint(station / bore.station[1]), 0, len(bore.station) - 1).astype(np.intp)
     angle = np.arctan2(upward, lateral)
     column = np.rint((angle - bore.angle[0]) / (2 * np.pi) * len(bore.angle)).astype(np.intp) % len(bore.angle)
-    on_wall = np.abs(np.hypot(lateral, upward) - bore.radius[row, column]) < _NEAR_WALL
+    on_wall = np.abs(np.hypot(lateral, upward) - bore.radius[bore.row_of(station), column]) < _NEAR_WALL
     on_wall &= (np.sin(angle) > _SIDES) & (station > 0) & (station < bore.length)
     wall = cloud.points[on_wall].astype(np.float64)
     if len(wall) < _PLACES:

@@ -8,9 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from scene.bore import Bore
-from scene.judging.codes import Code
+from scene.judging.codes import Code, name_span
 from scene.judging.judge import Warned
-from scene.judging.words import name_span
 
 _BOTTOM = np.deg2rad(28)  # to each side of straight down: floor
 _FLAT = 0.02  # m rms about a line: with more it is no flat floor

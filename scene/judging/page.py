@@ -3,9 +3,9 @@
 from typing import Any
 
 from scene.bore import Bore
+from scene.judging.codes import name_span
 from scene.judging.drawing import draw_plan, draw_profile, draw_section, draw_strips, text
 from scene.judging.judge import Judgement
-from scene.judging.words import name_span
 
 STYLE = """
 body{font:15px/1.45 system-ui,sans-serif;color:#1f2933;max-width:1060px;margin:24px auto;padding:0 16px}
@@ -28,11 +28,7 @@ _LEAST_SHOWN = 0.002  # a station whose unexplained share is less makes no pictu
 def render_page(name: str, bore: Bore, judgement: Judgement, content: dict[str, Any]) -> str:
     """Return the report of a build as HTML; the same build gives the same text.
 
-    Args:
-        name: Name of the tunnel.
-        bore: The bore as built.
-        judgement: What it explains.
-        content: Entries of the manifest.
+    `content` has entries of the manifest.
     """
     parts = [
         f"<h1>{text(name)}</h1>",

@@ -8,8 +8,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import label
 
 from scene.bore import Bore
+from scene.judging.codes import name_sides
 from scene.judging.returns import BEHIND, INSIDE, Returns
-from scene.judging.words import name_sides
 
 _CELL = 0.4  # m, edge of the boxes that join returns to a place
 _MIN_IN_CELL = 3  # points: a box with fewer holds strays
@@ -40,12 +40,7 @@ class Place:
 def find_places(bore: Bore, returns: Returns) -> tuple[tuple[Place, ...], Bool[np.ndarray, " p"]]:
     """Gathers unexplained returns into places, the largest first.
 
-    Args:
-        bore: The bore as built.
-        returns: All returns about it.
-
-    Returns:
-        The places, and a mask of the unexplained returns that belong to none: strays, `(p,)`.
+    Returns the places, and a mask of the unexplained returns that belong to none: strays, `(p,)`.
     """
     places: list[Place] = []
     scattered = np.zeros(len(returns.kind), bool)
@@ -87,7 +82,7 @@ def _join(returns: Returns, rows: Int[np.ndarray, " k"]) -> Int[np.ndarray, " k"
 def _describe(
     bore: Bore, returns: Returns, own: np.ndarray, behind: bool, start: float, end: float, around: float
 ) -> Place:
-    row = np.clip(np.rint(returns.station[own] / bore.station[1]), 0, len(bore.station) - 1).astype(np.intp)
+    row = bore.row_of(returns.station[own])
     floor, crown = _extent_on_axis(bore)
     above = returns.upward[own] - floor[row]
     low, high = (float(v) for v in np.percentile(above, [2, 98]))

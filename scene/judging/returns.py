@@ -59,16 +59,10 @@ class Returns:
 
 
 def compare_returns(bore: Bore, cloud: Cloud, tolerance: float, track: TrackZone | None = None) -> Returns:
-    """Compares every point of a cloud with the wall, the pockets and the track of a bore.
+    """Compares every point of a cloud in the bore's frame with the wall, the pockets and the track of a bore.
 
-    Args:
-        bore: The bore as built.
-        cloud: All that was registered, in the bore's frame.
-        tolerance: Distance from the model up to which a return is explained, m.
-        track: Space of the track; `None` where none was laid.
-
-    Returns:
-        One row for each point of the cloud, in its order. A return further than `tolerance` beyond an end is `BEYOND`.
+    Returns are explained up to `tolerance` from the model, m; further than that beyond an end they are `BEYOND`. The
+    rows are those of the cloud.
     """
     parts = [
         _compare(bore, cloud.points[k : k + _CHUNK].astype(np.float64), tolerance, track)
@@ -90,16 +84,11 @@ def _compare(bore: Bore, points: np.ndarray, tolerance: float, track: TrackZone 
         _in_pockets(bore, station, angle, outward, tolerance)[kind == BEHIND], EXPLAINED, BEHIND
     )
     if track is not None:
-        row = _rows(bore, station)
+        row = bore.row_of(station)
         low = (np.abs(lateral) < track.half_width + tolerance) & (upward < track.top[row] + tolerance)
         kind[low & (kind == INSIDE)] = EXPLAINED
     kind[beyond] = BEYOND
     return station, lateral, upward, angle, outward, kind
-
-
-def _rows(bore: Bore, station: np.ndarray) -> Int[np.ndarray, " p"]:
-    """Nearest station of the bore, as an index."""
-    return np.clip(np.rint(station / bore.station[1]), 0, len(bore.station) - 1).astype(np.intp)
 
 
 def wall_radius(bore: Bore, station: np.ndarray, angle: np.ndarray) -> Float[np.ndarray, " p"]:
@@ -121,7 +110,7 @@ def _distance_to_section(
 ) -> Float[np.ndarray, " p"]:
     """Distance to the nearest piece of the section's outline, m: near a corner the radius alone overstates it."""
     columns = len(bore.angle)
-    row = _rows(bore, station)
+    row = bore.row_of(station)
     left = np.floor((np.arctan2(upward, lateral) - bore.angle[0]) / (2 * np.pi) * columns).astype(np.intp)
     least = np.full(len(station), np.inf)
     for step in range(-_PIECES, _PIECES + 1):

@@ -1,4 +1,4 @@
-"""Sizes, grades and sections that no tunnel has, each with its likely cause: unit, axes, poses or clock."""
+"""What no tunnel has, each with its likely cause (unit, axes, poses, clock), and tracks laid beyond what was seen."""
 
 from typing import Any
 
@@ -7,11 +7,11 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
 from scene.bore import Bore
-from scene.judging.codes import Code
+from scene.fitting.trackseen import SeenTrack
+from scene.judging.codes import Code, name_sides, name_span
 from scene.judging.judge import Warned
 from scene.judging.lean import doubt_lean
-from scene.judging.shaft import doubt_shaft
-from scene.judging.words import name_sides, name_span
+from scene.writing.track import Track
 
 _SIZES = (1.0, 30.0)  # m, widths and heights of bores that people make
 _HIGH = 11.0  # m; higher are caverns and stations, and common tunnels in feet
@@ -26,11 +26,8 @@ _FACING = np.deg2rad(35)  # to each side of a direction
 def doubt_bore(bore: Bore, facts: dict[str, Any], provenance: dict[str, str], surveyed: bool) -> list[Warned]:
     """Return what is odd about a bore as a tunnel, and what nobody measured.
 
-    Args:
-        bore: The bore as built.
-        facts: Facts of reading and posing, for the manifest.
-        provenance: Provenance of the lining's parts.
-        surveyed: True where returns of a scanner were at hand; nobody expects a ring survey to show pockets.
+    `facts` and `provenance` are entries of the manifest. Nobody expects a survey of rings, not `surveyed` by a scanner,
+    to show pockets.
     """
     return [
         *_doubt_size(bore, str(facts.get("unit", "m"))),
@@ -193,3 +190,72 @@ def _tell_standard(bore: Bore, provenance: dict[str, str]) -> list[Warned]:
         f"{len(bore.pocket)} pockets stand where a standard lining has them, and none of them was seen; "
         "--lining none leaves them out",
     )]  # fmt: skip
+
+
+_EVEN = 0.05  # m rms: a section that differs less from itself upside down has neither floor nor crown
+_GUESSED = "longest along z"  # as `scene.reading.source` says it
+
+
+def doubt_shaft(bore: Bore, axes: str) -> list[Warned]:
+    """Warn of a guess that y is up; refuse the bore where its section is the same upside down, as that of a shaft.
+
+    `axes` says which were taken, and why, as the manifest has it.
+    """
+    if _GUESSED not in axes:
+        return []
+    section = np.median(bore.radius, axis=0)
+    turned = np.interp(-bore.angle, bore.angle, section, period=2 * np.pi)
+    even = float(np.sqrt(np.mean((section - turned) ** 2))) < _EVEN
+    size = f"{bore.length:.0f} m along z and {bore.width.mean():.1f} m across"
+    if even:
+        return [Warned(
+            Code.SHAFT,
+            f"no tunnel in the cloud but a vertical shaft, {size}: its section has neither floor nor crown; if it is a "
+            "tunnel, --axes x-zy says that y is up in the file",
+            refuses=True,
+        )]  # fmt: skip
+    return [Warned(
+        Code.AXES,
+        f"the cloud is {size}, so y was taken as up; if it is a vertical shaft, it is no tunnel, and if z is up, "
+        "--axes xyz says so",
+    )]  # fmt: skip
+
+
+_FEW = 0.5  # share of the sleepers seen: with fewer, their places are the spacing's
+
+_THIN = "the returns on the floor are too few to show any, or their sleepers: a track is easily missed"
+
+
+def doubt_track(track: Track, seen: SeenTrack, pose_doubt: str | None = None) -> list[Warned]:
+    """Return what nobody saw of a track that the survey shows in part, or could not show; a ring survey can show none.
+
+    `pose_doubt` is the sentence on poses that blur the walls; `None` where they do not.
+    """
+    sought = track.config.lay == "auto" and seen.sought
+    if sought and all(line.rails is None for line in seen.lines) and (pose_doubt or seen.thin):
+        why = f"{pose_doubt}: rails blur as the walls do, and may be there" if pose_doubt else _THIN
+        return [Warned(Code.RAILS, f"no rails were seen, but {why}; --track standard lays a track")]
+    left_out = sum(line.left_out for line in track.lines)
+    if left_out:
+        return [Warned(
+            Code.SLEEPERS,
+            f"{left_out} sleepers are left out: {track.config.sleeper_length:g} m long, they would come within "
+            f"{track.config.margin:g} m of a wall; --track.sleeper-length gives them the length that is there",
+        )]  # fmt: skip
+    if track.config.lay != "auto" or not seen.sought or len(seen.lines) != len(track.lines):
+        return []
+    count, measured = len(track.measured), int(track.measured.sum())
+    if not count or measured >= _FEW * count:
+        return []
+    told = "none of them was seen" if not measured else f"only {measured} of them were seen"
+    return [Warned(
+        Code.SLEEPERS,
+        f"{count} sleepers lie where a spacing of {_spacing(track):.2f} m asks for them, and {told}: the returns "
+        "between the rails are too few, or lie too even, to tell them; --track none leaves the track out",
+    )]  # fmt: skip
+
+
+def _spacing(track: Track) -> float:
+    """Mean distance of neighbouring sleepers, m."""
+    lines = [line.sleeper_station for line in track.lines if len(line.sleeper_station) > 1]
+    return float(sum(line[-1] - line[0] for line in lines) / max(sum(len(line) - 1 for line in lines), 1))

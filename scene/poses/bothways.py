@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from scene.geometry import arc_length
 from scene.poses.registration import deskew
 from scene.poses.trajectory import Trajectory
 from scene.reading.times import Scan
@@ -70,13 +71,8 @@ def find_tilt(scans: list[Scan], poses: Trajectory) -> Tilt | None:
 
 
 def numbers_along(stamps: Float[np.ndarray, " n"], poses: Trajectory) -> list[int]:
-    """Return the numbers of sweeps some way apart from a stretch about the middle of a recording.
-
-    Args:
-        stamps: Header of each sweep, s.
-        poses: Poses of the LiDAR.
-    """
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses.positions, axis=0), axis=1))])
+    """Return the numbers of sweeps some way apart about the middle of a recording, by their headers, s."""
+    way = arc_length(poses.positions)
     first, begin, due = max(len(stamps) // 2 - _MOST_SCANS // 2, 0), None, -np.inf
     chosen: list[int] = []
     for number in range(first, min(first + _MOST_SCANS, len(stamps))):

@@ -114,7 +114,7 @@ def level_rotation(
 ) -> Rotation:
     """Return the smallest turn that makes gravity vertical, averaged over the recording; none without an IMU."""
     if inertial is None or mount is None:
-        up = recording.up_at_start(_START_TIME)
+        up = _up_at_start(recording)
     else:
         inside = (inertial.times >= trajectory.times[0]) & (inertial.times <= trajectory.times[-1])
         _, turns = trajectory.at(inertial.times[inside])
@@ -122,3 +122,18 @@ def level_rotation(
     if up is None or not np.linalg.norm(up) > 0:
         return Rotation.identity()
     return Rotation.align_vectors([[0.0, 0.0, 1.0]], [up / np.linalg.norm(up)])[0]
+
+
+def _up_at_start(recording: Recording) -> Float[np.ndarray, "3"] | None:
+    """Return the force that the IMU in the LiDAR's own housing shows at first, in its axes and unit; `None` without."""
+    beside = recording.topic.rsplit("/", 1)[0]
+    topic = next((topic for topic in imu_topics(recording) if topic.rsplit("/", 1)[0] == beside), None)
+    if topic is None:
+        return None
+    total, start = np.zeros(3), None
+    for time, _, force in imu_samples(recording, topic):
+        start = time if start is None else start
+        if time - start > _START_TIME:
+            break
+        total += force
+    return total if np.isfinite(total).all() else None

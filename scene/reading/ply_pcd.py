@@ -9,7 +9,7 @@ import numpy as np
 from plyfile import PlyData
 from pypcd4.pypcd4 import Encoding, MetaData
 
-from scene.reading.source import CloudSource, Lines, source_from_records
+from scene.reading.source import CloudSource, Lines, source_from_records, source_from_text
 
 _HEADER_LIMIT = 1 << 16
 _PLY_BYTES = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "float": 4, "double": 8}
@@ -22,13 +22,7 @@ def open_ply(path: Path) -> CloudSource:
     form = lines[1].split()[1] if len(lines) > 1 and lines[1].startswith("format ") else "unknown"
     count, names, first = _ply_vertices(lines, path.stat().st_size - size, form == "ascii")
     if form == "ascii" and first:
-        missing = [name for name in "xyz" if name not in names]
-        if missing:
-            raise ValueError(f"it has no field {', '.join(missing)}")
-        columns = tuple(names.index(name) for name in "xyz")
-        text = Lines(path, columns, start=size, line=len(lines) + 1, count=count)
-        sample = next(text.rows(), np.empty((0, 3)))
-        return CloudSource("PLY ascii", text.rows, sample)
+        return source_from_text("PLY ascii", path, names, size, len(lines) + 1, count)
     return source_from_records(f"PLY {form}", read_ply_records(path))
 
 
@@ -80,13 +74,7 @@ def open_pcd(path: Path) -> CloudSource:
     """Opens the points of a PCD file; raises `ValueError` for damage, or fewer bytes than its header promises."""
     meta, start, line = _pcd_header(path)
     if meta.data is Encoding.ASCII:
-        names = _column_names(meta)
-        missing = [name for name in "xyz" if name not in names]
-        if missing:
-            raise ValueError(f"it has no field {', '.join(missing)}")
-        text = Lines(path, tuple(names.index(n) for n in "xyz"), start=start, line=line, count=meta.points)
-        first = next(text.rows(), np.empty((0, 3))) if meta.points else np.empty((0, 3))
-        return CloudSource("PCD ascii", text.rows, first)
+        return source_from_text("PCD ascii", path, _column_names(meta), start, line, meta.points)
     return source_from_records(f"PCD {meta.data.value}", read_pcd_records(path))
 
 

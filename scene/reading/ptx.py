@@ -8,12 +8,11 @@ from collections import Counter
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 from jaxtyping import Float
 
-from scene.reading.source import BATCH, CloudSource
+from scene.reading.source import BATCH, CloudSource, Lines
 
 _HEADER = 10  # lines
 _MOST = 1 << 33  # points of a scan
@@ -22,18 +21,23 @@ _MOST = 1 << 33  # points of a scan
 def open_ptx(path: Path) -> CloudSource:
     """Opens all scans of a PTX file, in the file's frame, m; raises `ValueError`, which names the line at fault."""
     left_out: Counter[str] = Counter()
+    text = Lines(path, (0, 1, 2))
 
     def chunks() -> Iterator[np.ndarray]:
         left_out.clear()
-        with path.open(encoding="ascii", errors="replace") as file:
+        with path.open("rb") as file:
             line = 1
             while header := list(islice(file, _HEADER)):
-                if not "".join(header).strip():
+                if not b"".join(header).strip():
                     return
                 count, matrix = _read_header(header, line)
                 line += _HEADER
                 for start in range(0, count, BATCH):
-                    rows = _read_points(file, min(BATCH, count - start), line + start)
+                    lines = list(islice(file, min(BATCH, count - start)))
+                    rows = text.parse(b"".join(lines), line + start)
+                    if len(rows) < min(BATCH, count - start):
+                        left = count - start - len(rows)
+                        raise ValueError(f"it ends {left} of {count} points before a scan's header says")
                     back = (rows != 0).any(axis=1)
                     if not back.all():
                         left_out["no_return"] += int((~back).sum())
@@ -44,7 +48,7 @@ def open_ptx(path: Path) -> CloudSource:
     return CloudSource("PTX", chunks, first[:: max(len(first) // 2000, 1)], "m", left_out=left_out)
 
 
-def _read_header(lines: list[str], first: int) -> tuple[int, Float[np.ndarray, "4 4"]]:
+def _read_header(lines: list[bytes], first: int) -> tuple[int, Float[np.ndarray, "4 4"]]:
     """Return the number of points of a scan, and its matrix; `first` is the number of its first line."""
     try:
         numbers = [[float(word) for word in line.split()] for line in lines]
@@ -55,22 +59,3 @@ def _read_header(lines: list[str], first: int) -> tuple[int, Float[np.ndarray, "
         return columns * rows, matrix
     except (ValueError, IndexError) as error:
         raise ValueError(f"lines {first} to {first + _HEADER - 1} are no header of a PTX scan") from error
-
-
-def _read_points(file: IO[str], count: int, first: int) -> Float[np.ndarray, "n 3"]:
-    """Return x, y and z of the next lines; `first` is the number of the first."""
-    lines = list(islice(file, count))
-    if len(lines) < count:
-        raise ValueError(f"it ends at line {first + len(lines)}, {count - len(lines)} points before its header says")
-    try:
-        return np.loadtxt(lines, usecols=(0, 1, 2), ndmin=2)
-    except ValueError as error:
-        bad = next((k for k, line in enumerate(lines) if not _holds_point(line)), 0)
-        raise ValueError(f"line {first + bad} holds no point: {lines[bad].strip()[:60]!r}") from error
-
-
-def _holds_point(line: str) -> bool:
-    try:
-        return len([float(word) for word in line.split()[:3]]) == 3
-    except ValueError:
-        return False

@@ -13,10 +13,9 @@ from jaxtyping import Float
 from scene.errors import RecordingError
 from scene.reading.formats import detect
 from scene.reading.scans import ScanSource
-from scene.reading.source import cause, refuse_damage
+from scene.reading.source import refuse_damage
 from scene.reading.times import MOST_BAD, Convention, RawScan, Scan, Spans, TimeConfig
 
-_IMU_TYPE = "sensor_msgs/msg/Imu"
 _MOST_OUT_OF_ORDER = 0.05
 _LONGEST_PAUSE = 3600.0  # s; a stamp further from the last one is damage, and would make all later ones look late
 
@@ -188,26 +187,3 @@ class Recording:
             raise RecordingError(f"{self.path}: {self.topic} holds no scan with a return in it")
         _ = self.convention
         return self.facts
-
-    def up_at_start(self, duration: float) -> Float[np.ndarray, "3"] | None:
-        """Return the unit vector against gravity in the LiDAR's frame, over the first `duration` s; `None` without IMU.
-
-        Reads the IMU beside the LiDAR's topic (`/livox/imu` for `/livox/lidar`), which shares its axes, in any unit.
-        Raises `RecordingError` where a message is damaged.
-        """
-        beside = self.topic.rsplit("/", 1)[0]
-        imus = [c for c in self.reader.connections if c.msgtype == _IMU_TYPE and c.topic.rsplit("/", 1)[0] == beside]
-        if not imus:
-            return None
-        total, start = np.zeros(3), None
-        try:
-            for _, stamp, raw in self.reader.messages(connections=imus[:1]):
-                start = stamp if start is None else start
-                if stamp - start > duration * 1e9:
-                    break
-                force = self.deserialize(raw, _IMU_TYPE).linear_acceleration
-                total += (force.x, force.y, force.z)
-        except Exception as error:  # the library raises anything on damage
-            raise RecordingError(f"{self.path}: a message of {imus[0].topic} is damaged ({cause(error)})") from error
-        length = float(np.linalg.norm(total))
-        return total / length if np.isfinite(length) and length > 0 else None

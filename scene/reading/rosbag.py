@@ -22,7 +22,6 @@ from scene.reading.scans import (
     RawScan,
     ScanSource,
     parse_custom_msg,
-    parse_custom_msg_cdr,
     parse_pointcloud2,
 )  # fmt: skip
 from scene.reading.source import cause, one_line, refuse_damage
@@ -151,7 +150,7 @@ class RosBag(ScanSource):
 
     def _parse(self, raw: bytes, received: float) -> RawScan:
         if self._type in LIVOX_TYPES:
-            scan = parse_custom_msg(raw) if self._ros1 else parse_custom_msg_cdr(raw)
+            scan = parse_custom_msg(raw, cdr=not self._ros1)
         else:
             try:
                 message = self.deserialize(raw, POINTCLOUD2_TYPE)

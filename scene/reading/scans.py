@@ -102,35 +102,24 @@ _LIVOX_POINT_CDR = np.dtype({"names": ["point"], "formats": [_LIVOX_POINT], "ite
 _TAG_RETURN_MASK = 0x20
 
 
-def parse_custom_msg(raw: bytes) -> RawScan:
-    """Parses a `CustomMsg` as ROS1 serialises it; raises `ValueError` where the bytes are not a whole one.
+def parse_custom_msg(raw: bytes, cdr: bool = False) -> RawScan:
+    """Parses a `CustomMsg` as ROS1 serialises it, or ROS2 (CDR, little-endian); `ValueError` where it is no whole one.
 
     Points at the origin (no return), not finite, or tagged as noise are dropped.
     """
     try:
-        _, secs, nsecs, frame_length = struct.unpack_from("<IIII", raw, 0)
-        offset = 16 + frame_length + struct.calcsize("<QIB3B")
-        (count,) = struct.unpack_from("<I", raw, offset)
-        points = np.frombuffer(raw, _LIVOX_POINT, count, offset + 4)
-    except (struct.error, ValueError) as error:
-        raise ValueError(f"not a whole CustomMsg: {error}") from error
-    return _livox_scan(secs + nsecs * 1e-9, points)
-
-
-def parse_custom_msg_cdr(raw: bytes) -> RawScan:
-    """Parses a `CustomMsg` as ROS2 serialises it (CDR, little-endian); otherwise as `parse_custom_msg`."""
-    try:
-        if raw[:2] != b"\x00\x01":
+        if cdr and raw[:2] != b"\x00\x01":
             raise ValueError(f"encapsulation {raw[:2].hex()} is not little-endian CDR")
-        body = raw[4:]  # alignment counts from behind the encapsulation header
-        secs, nsecs, frame_length = struct.unpack_from("<iII", body, 0)
-        timebase = -(-(12 + frame_length) // 8) * 8
+        body = raw[4:] if cdr else raw  # alignment counts from behind the encapsulation header
+        secs, nsecs, frame_length = struct.unpack_from("<iII" if cdr else "<4xIII", body, 0)
+        timebase = -(-(12 + frame_length) // 8) * 8 if cdr else 16 + frame_length
         offset = timebase + struct.calcsize("<QIB3B")
         (count,) = struct.unpack_from("<I", body, offset)
-        size = count * _LIVOX_POINT_CDR.itemsize
-        # One point's padding may be missing at the end.
-        padded = body[offset + 4 : offset + 4 + size] + b"\0" * (len(body) == offset + 3 + size)
-        points = np.frombuffer(padded, _LIVOX_POINT_CDR, count)["point"]
+        if cdr:
+            body += b"\0" * (len(body) == offset + 3 + count * _LIVOX_POINT_CDR.itemsize)  # the last padding may miss
+            points = np.frombuffer(body, _LIVOX_POINT_CDR, count, offset + 4)["point"]
+        else:
+            points = np.frombuffer(body, _LIVOX_POINT, count, offset + 4)
     except (struct.error, ValueError) as error:
         raise ValueError(f"not a whole CustomMsg: {error}") from error
     return _livox_scan(secs + nsecs * 1e-9, points)

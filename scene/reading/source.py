@@ -3,7 +3,7 @@
 import re
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -60,11 +60,14 @@ class CloudSource:
     left_out: Counter[str] = field(default_factory=Counter)
 
 
+def _require_xyz(names: Sequence[str]) -> None:
+    if missing := [name for name in "xyz" if name not in names]:
+        raise ValueError(f"it has no field {', '.join(missing)}")
+
+
 def stack_xyz(records: np.ndarray) -> Float[np.ndarray, "n 3"]:
     """Return x, y and z of structured records as float64; raises `ValueError` where one is missing."""
-    missing = [name for name in "xyz" if name not in (records.dtype.names or ())]
-    if missing:
-        raise ValueError(f"it has no field {', '.join(missing)}")
+    _require_xyz(records.dtype.names or ())
     with np.errstate(invalid="ignore"):  # bit patterns that are no number; they are dropped later
         return np.stack([records[name] for name in "xyz"], axis=1).astype(np.float64)
 
@@ -99,9 +102,11 @@ class Lines:
         line, left = self.line, self.count
         with self.path.open("rb") as file:
             file.seek(self.start)
-            rest = b""
-            while block := file.read(_TEXT_BLOCK):
-                whole, _, rest = (rest + block).rpartition(b"\n")
+            rest, last = b"", False
+            while not last and left != 0:
+                block = file.read(_TEXT_BLOCK)
+                last = not block
+                whole, _, rest = (rest, b"", b"") if last else (rest + block).rpartition(b"\n")
                 breaks = whole.count(b"\n") + 1 if whole else 0
                 if len(rest) > _TEXT_BLOCK:
                     raise ValueError(f"line {line + breaks} does not end")
@@ -110,12 +115,6 @@ class Lines:
                     left = None if left is None else left - len(rows)
                     yield rows
                 line += breaks
-                if left == 0:
-                    return
-            if rest.strip():
-                rows = self.parse(rest, line, left)
-                left = None if left is None else left - len(rows)
-                yield rows
         if left:
             raise ValueError(f"it ends after {(self.count or 0) - left} of {self.count} points")
 
@@ -147,6 +146,14 @@ class Lines:
                 shown = line if len(line) <= 60 else line[:60] + "…"
                 return f"line {first + index} has no numbers in columns {[c + 1 for c in self.columns]}: {shown!r}"
         return None
+
+
+def source_from_text(format: str, path: Path, names: list[str], start: int, line: int, count: int) -> CloudSource:
+    """Return a source over `count` lines with a number for each of `names`, from a byte on; `line` is its number."""
+    _require_xyz(names)
+    text = Lines(path, tuple(names.index(name) for name in "xyz"), start=start, line=line, count=count)
+    none = np.empty((0, 3))
+    return CloudSource(format, text.rows, next(text.rows(), none) if count else none)
 
 
 # Metres of each. Source: NIST SP 811, B.6: the international foot, and the US survey foot of 1200/3937 m.

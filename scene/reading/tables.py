@@ -43,28 +43,21 @@ def is_map_name(name: str) -> bool:
     return plain_name(name)[0] in _XYZ_NAMES[0][1:]
 
 
-def parse_columns(text: str | None) -> dict[str, str]:
-    """Return the columns that a user names, `x=Rechtswert,y=Hochwert,z=Hoehe`, by what they hold.
-
-    Keys are x, y, z, ring, point and offset; a column is its name in the header, or its number from 1. Raises
-    `ValueError` for any other text.
-    """
-    pairs = [part.partition("=") for part in (text or "").split(",") if part.strip()]
-    columns = {key.strip().lower(): name.strip() for key, _, name in pairs}
-    if set(columns) - set(COLUMN_KEYS) or not all(columns.values()) or len(columns) < len(pairs):
-        raise ValueError(f"columns {text!r} are not pairs such as x=Rechtswert,y=Hochwert,z=Hoehe ({COLUMN_KEYS})")
-    return columns
-
-
 COLUMN_KEYS = ("x", "y", "z", "ring", "point", "offset")
 
 
 def told_columns(path: Path, text: str | None) -> dict[str, str] | None:
-    """Return the columns of a file that a user names; raises `RecordingError` where they are none."""
-    try:
-        return parse_columns(text) or None
-    except ValueError as error:
-        raise RecordingError(f"{path}: {error}") from error
+    """Return the columns of a file that a user names, `x=Rechtswert,y=Hochwert,z=Hoehe`, by what they hold.
+
+    Keys are those of `COLUMN_KEYS`; a column is its name in the header, or its number from 1. `None` where none is
+    named. Raises `RecordingError` for any other text.
+    """
+    pairs = [part.partition("=") for part in (text or "").split(",") if part.strip()]
+    columns = {key.strip().lower(): name.strip() for key, _, name in pairs}
+    if set(columns) - set(COLUMN_KEYS) or not all(columns.values()) or len(columns) < len(pairs):
+        example = "x=Rechtswert,y=Hochwert,z=Hoehe"
+        raise RecordingError(f"{path}: columns {text!r} are not pairs such as {example} ({COLUMN_KEYS})")
+    return columns or None
 
 
 def find_column(names: Sequence[str], told: str) -> int | None:
@@ -79,7 +72,7 @@ def find_column(names: Sequence[str], told: str) -> int | None:
 def find_xyz(names: Sequence[str], told: dict[str, str] | None = None) -> tuple[list[int], str | None] | None:
     """Finds the columns of x, y and z, and their declared unit; `None` where one is missing.
 
-    `told` names columns as `parse_columns` returns them. Raises `ValueError` where the three declare different units.
+    `told` names columns as `told_columns` returns them. Raises `ValueError` where the three declare different units.
     """
     known = [plain_name(name) for name in names]
     bare = [name for name, _ in known]
@@ -105,7 +98,7 @@ _DELIMITERS = ((";", "semicolon"), ("\t", "tab"), (",", "comma"))
 def open_table(path: Path, told: dict[str, str] | None = None) -> CloudSource:
     """Opens a text table: columns that the user named, by the names of its header, or the first three.
 
-    `told` is what `parse_columns` returns. Raises `ValueError` where it is no text, or no line near its start holds
+    `told` is what `told_columns` returns. Raises `ValueError` where it is no text, or no line near its start holds
     three numbers.
     """
     with path.open("rb") as file:

@@ -7,7 +7,7 @@ import numpy as np
 
 from scene.survey.alignment import Alignment, Elements, draw_grade, draw_railway, draw_s_bend, lay_out, metro_elements
 from scene.survey.config import TruthName
-from scene.survey.furniture import SLEEPER_RISE, Furniture, draw_furniture
+from scene.survey.furniture import DESIGN, SLEEPER_RISE, Furniture, Sizes, draw_furniture, draw_sizes
 from scene.survey.mesh import Mesh, join_meshes, nail_mesh, surface_mesh, track_mesh
 from scene.survey.section import (
     Section,
@@ -22,7 +22,6 @@ from scene.survey.section import (
     rectangle,
     vault,
 )  # fmt: skip
-from scene.survey.sizes import DESIGN, Sizes, draw_sizes
 from scene.survey.surroundings import Cutting, Thing, box_thing, cutting_mesh, draw_cutting, round_thing, thing_mesh
 
 # The paper counts 351 m / 0.6 m + 1 = 586 sleepers, which needs one in the middle of each mouth. So far apart, 586 lie

@@ -54,15 +54,13 @@ class SurveyConfig:
     # Draw sizes (gauge, rings, pockets ...) within building tolerance.
     tolerances: bool = False
     correlation: float = 2.0  # Correlation length of the walls of `irregular`, m.
-    # LiDARs, each with its own recording; with none, truth and clouds alone.
+    # LiDARs, each with its own recording; with none, the truth alone.
     sensors: tuple[LidarName, ...] = ("avia",)
     scan_every: int = 1  # Keep every so many scans of the VLP-16 and the OS1.
     speed: float = 1.0  # Mean walking speed, m/s.
     point_rate: int = 240_000  # Points per second of the Avia; fewer thin the survey.
     # Also write the first sensor's returns as `cloud.ply` and `cloud.pcd`.
     cloud: bool = False
-    # Write profiles so far apart, m, as `cloud.ply`, and `held_out.ply` between.
-    profiles: float = 0.0
     # Errors of the instruments. Zero, or the flag's `no-` form, switches a part off.
     errors: SensorErrors = field(default_factory=SensorErrors)
 
@@ -89,10 +87,8 @@ def check_survey(config: SurveyConfig) -> None:
         raise ValueError(f"scan_every must be at least 1, got {config.scan_every}")
     if len(set(config.sensors)) < len(config.sensors):
         raise ValueError(f"sensors must differ from each other, got {' '.join(config.sensors)}")
-    if config.profiles and not 0.1 <= config.profiles <= 0.5 * config.length:
-        raise ValueError(f"profiles must lie between 0.1 m and half the length, got {config.profiles:g}")
-    if config.cloud and (config.profiles or not config.sensors):
-        raise ValueError("cloud needs a sensor, and cannot be written beside profiles: both are named cloud.ply")
+    if config.cloud and not config.sensors:
+        raise ValueError("cloud needs a sensor, got none")
     _check_errors(config.errors)
     # The nearest existing parent decides whether the folder can be made.
     for folder in (config.out, *config.out.parents):

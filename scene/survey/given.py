@@ -87,15 +87,10 @@ class GivenBore:
 
 
 def read_given(path: Path, lining: str, length: float) -> GivenBore:
-    """Reads the first `length` m of a tunnel file.
+    """Reads the first `length` m of a `tunnel.npz` with its bore in three dimensions.
 
-    Args:
-        path: A `tunnel.npz` with its bore in three dimensions.
-        lining: Variant of its walls; empty for `pockets`, or the first where there is none of that name.
-        length: Length wanted, m.
-
-    Raises:
-        ValueError: The file is no such file, holds no bore in three dimensions, or not this lining or length.
+    An empty `lining` takes `pockets`, or the first where there is none of that name. Raises `ValueError` where the file
+    is no such file, holds no bore in three dimensions, or not this lining or length.
     """
     fields = _read(path)
     names = [str(name) for name in fields["lining"]]

@@ -4,20 +4,15 @@ import struct
 
 import numpy as np
 from jaxtyping import Float
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from scene.survey.lidar import Lidar, Sweep
 
 EPOCH = 1_700_000_000  # s: stamp of the first point, the same for every survey
 
-CUSTOM_TYPE, CUSTOM_MD5 = "livox_ros_driver/msg/CustomMsg", "e4d6829bdfe657cb6c21a746c86b21a6"
-IMU_TYPE, IMU_MD5 = "sensor_msgs/msg/Imu", "6a62c6daae103f4ff57a132d6f95cec2"
+CUSTOM_TYPE, IMU_TYPE = "livox_ros_driver/msg/CustomMsg", "sensor_msgs/msg/Imu"
+CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
 _RULE = "=" * 80
-_HEADER_TEXT = f"""{_RULE}
-MSG: std_msgs/Header
-uint32 seq
-time stamp
-string frame_id
-"""
 CUSTOM_DEFINITION = f"""Header header
 uint64 timebase
 uint32 point_num
@@ -25,7 +20,12 @@ uint8 lidar_id
 uint8[3] rsvd
 CustomPoint[] points
 
-{_HEADER_TEXT}
+{_RULE}
+MSG: std_msgs/Header
+uint32 seq
+time stamp
+string frame_id
+
 {_RULE}
 MSG: livox_ros_driver/CustomPoint
 uint32 offset_time
@@ -36,28 +36,8 @@ uint8 reflectivity
 uint8 tag
 uint8 line
 """
-IMU_DEFINITION = f"""Header header
-geometry_msgs/Quaternion orientation
-float64[9] orientation_covariance
-geometry_msgs/Vector3 angular_velocity
-float64[9] angular_velocity_covariance
-geometry_msgs/Vector3 linear_acceleration
-float64[9] linear_acceleration_covariance
-
-{_HEADER_TEXT}
-{_RULE}
-MSG: geometry_msgs/Quaternion
-float64 x
-float64 y
-float64 z
-float64 w
-
-{_RULE}
-MSG: geometry_msgs/Vector3
-float64 x
-float64 y
-float64 z
-"""
+STORE = get_typestore(Stores.ROS1_NOETIC)  # definitions of all messages here
+STORE.register(get_types_from_msg(CUSTOM_DEFINITION, CUSTOM_TYPE))
 
 # CustomPoint as it lies in the message: 19 bytes, packed.
 POINT = np.dtype([
@@ -120,33 +100,6 @@ def imu_messages(
     return [row.tobytes() for row in rows]
 
 
-CLOUD_TYPE, CLOUD_MD5 = "sensor_msgs/msg/PointCloud2", "1158d486dd51d683ce2f1be655c3c181"
-CLOUD_DEFINITION = f"""std_msgs/Header header
-uint32 height
-uint32 width
-sensor_msgs/PointField[] fields
-bool is_bigendian
-uint32 point_step
-uint32 row_step
-uint8[] data
-bool is_dense
-
-{_HEADER_TEXT}
-{_RULE}
-MSG: sensor_msgs/PointField
-uint8 INT8=1
-uint8 UINT8=2
-uint8 INT16=3
-uint8 UINT16=4
-uint8 INT32=5
-uint8 UINT32=6
-uint8 FLOAT32=7
-uint8 FLOAT64=8
-string name
-uint32 offset
-uint8 datatype
-uint32 count
-"""
 _CODES = {"u1": 2, "u2": 4, "u4": 6, "f4": 7}
 # velodyne_pointcloud's PointXYZIRT, packed: 22 bytes.
 VELODYNE_POINT = np.dtype([

@@ -20,7 +20,7 @@ from scene.survey.given_truth import describe_given
 from scene.survey.lidar import SCAN_PERIOD, Lidar, Sweep, avia, os1, vlp16
 from scene.survey.mesh import Mesh
 from scene.survey.rack import IMUS, LIDARS, calibration
-from scene.survey.sweeps import n_sweeps, sweeps, write_profiles
+from scene.survey.sweeps import n_sweeps, sweeps
 from scene.survey.write import CloudWriter, describe_truth, write_json, write_mesh, write_tum, write_yaml
 from subterra_jax.host.files import replace_file
 
@@ -34,21 +34,17 @@ class Device:
     lidar: Lidar  # The model
     suffix: str  # Ending of the names of its files
     topic: str  # Topic of its sweeps
-    kind: tuple[str, str, str]  # Type, definition and MD5 sum of its messages
+    kind: str  # Type of its messages
     encode: Callable[[Sweep, Lidar], bytes]  # A sweep as one of them
-
-
-_LIVOX = (messages.CUSTOM_TYPE, messages.CUSTOM_DEFINITION, messages.CUSTOM_MD5)
-_CLOUD = (messages.CLOUD_TYPE, messages.CLOUD_DEFINITION, messages.CLOUD_MD5)
 
 
 def make_device(name: LidarName, config: SurveyConfig) -> Device:
     """Return the device called `name`."""
     if name == "avia":
-        return Device(avia(config.point_rate), "", "/livox/lidar", _LIVOX, messages.custom_message)
+        return Device(avia(config.point_rate), "", "/livox/lidar", messages.CUSTOM_TYPE, messages.custom_message)
     if name == "vlp16":
-        return Device(vlp16(), "_vlp16", "/velodyne_points", _CLOUD, messages.velodyne_message)
-    return Device(os1(), "_os1", "/ouster/points", _CLOUD, messages.ouster_message)
+        return Device(vlp16(), "_vlp16", "/velodyne_points", messages.CLOUD_TYPE, messages.velodyne_message)
+    return Device(os1(), "_os1", "/ouster/points", messages.CLOUD_TYPE, messages.ouster_message)
 
 
 def draw_imu_messages(
@@ -74,14 +70,10 @@ def write_recording(
     the order of time.
     """
     returns, waiting = 0, iter([*inertial, (2**62, "", b"")])
-    kinds = {topic: (messages.IMU_TYPE, messages.IMU_DEFINITION, messages.IMU_MD5) for _, topic, _ in inertial}
-    kinds[device.topic] = device.kind
+    kinds = {topic: messages.IMU_TYPE for _, topic, _ in inertial} | {device.topic: device.kind}
     with ExitStack() as stack:
         bag = stack.enter_context(Writer(stack.enter_context(replace_file(path))))
-        topics = {
-            name: bag.add_connection(name, kind, msgdef=text, md5sum=md5)
-            for name, (kind, text, md5) in sorted(kinds.items())
-        }
+        topics = {name: bag.add_connection(name, kinds[name], typestore=messages.STORE) for name in sorted(kinds)}
         at, topic, raw = next(waiting)
         for sweep in sweeps:
             end = sweep.begin + round(SCAN_PERIOD * 1e9)
@@ -104,7 +96,7 @@ _BEHIND = {"avia": 20.0}  # m of bore that a LiDAR sees behind itself, where it 
 
 def simulate(config: SurveyConfig, console: Console) -> str:
     """Writes the survey of `config`; returns a line that says what was written."""
-    of_bore, of_walk, of_prism, of_profiles, of_sensors = np.random.SeedSequence(config.seed).spawn(5)
+    of_bore, of_walk, of_prism, _, of_sensors = np.random.SeedSequence(config.seed).spawn(5)
     bore: Bore | GivenBore
     if config.truth_file is None:
         bore = draw_bore(of_bore, config.length, config.truth, config.correlation, config.tolerances)
@@ -122,8 +114,6 @@ def simulate(config: SurveyConfig, console: Console) -> str:
     prism = measure_prism(np.random.default_rng(of_prism), walk, config.errors.prism_noise)
     write_tum(config.out / "prism.tum", *prism, None)
     parts = [f"{config.out}: {config.length:g} m"]
-    if config.profiles:
-        parts.append(f"{write_profiles(config, bore, Caster(mesh), of_profiles)} points in profiles")
     # A sensor's noise does not depend on which others are on the rack.
     seeds = dict(zip(LIDARS, of_sensors.spawn(len(LIDARS)), strict=True))
     for name in config.sensors:

@@ -129,7 +129,7 @@ def add_materials(parts: SceneParts, rings: bool, reuse: bool) -> None:
 def add_lights(world: ET.Element, bore: Bore, track: Track, spacing: float) -> int:
     """Adds a light at every lamp; those nearest the start are on, since few can be at a time."""
     station = np.arange(spacing / 2, bore.length, spacing)
-    crown = np.array([np.interp(np.pi / 2, bore.angle, radius, period=2 * np.pi) for radius in bore.radius])
+    crown = bore.toward(np.pi / 2)
     at = bore.axis.at(station)
     lamp = at.position + (np.interp(station, bore.station, crown) - 0.5)[:, None] * at.up
     for k, position in enumerate(lamp):

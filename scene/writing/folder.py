@@ -145,13 +145,7 @@ def _describe_scene(
 ) -> dict[str, Any]:
     """Return the entries of the manifest that say what the scene is and where each part comes from.
 
-    Args:
-        name: Name of the scene.
-        result: The reconstruction.
-        track: The track laid in it.
-        provenance: Provenance of the input.
-        count: Number of things of each kind that were written.
-        furnished: Provenance of the furniture, by kind.
+    `count` is the number of things of each kind that were written.
     """
     bore = result.bore
     assets = {**track_provenance(track, result.seen), **result.provenance}

@@ -223,7 +223,7 @@ def _plates(space: TunnelSpace) -> list[Piece]:
 
 def _lamps(space: TunnelSpace) -> list[Piece]:
     pieces, bore = [], space.bore
-    crown = np.array([np.interp(np.pi / 2, bore.angle, radius, period=2 * np.pi) for radius in bore.radius])
+    crown = bore.toward(np.pi / 2)
     ceiling = bore.position[:, 2] + crown * bore.up[:, 2] - space.track.elevation
     for station in _stations(space, space.config.lamp_spacing):
         height = float(np.interp(station, bore.station, ceiling))

@@ -24,6 +24,12 @@ def add_element(parent: ET.Element, tag: str, **attributes: str) -> ET.Element:
     return ET.SubElement(parent, tag, attributes)
 
 
+def write_xml(path: Path, root: ET.Element) -> None:
+    """Writes an element with all below it, indented, in UTF-8 behind a declaration."""
+    ET.indent(root)
+    path.write_bytes(ET.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n")
+
+
 def format_numbers(values: ArrayLike) -> str:
     """Formats numbers for MJCF, six digits."""
     return " ".join(f"{value:.6g}" for value in np.ravel(values))

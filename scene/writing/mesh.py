@@ -6,7 +6,7 @@ from jaxtyping import Bool, Float, Int
 from manifold3d import Manifold, Mesh64, OpType
 
 from scene.bore import Bore
-from scene.errors import FitError
+from scene.errors import FitError, Refusal
 from scene.fitting.assemble import find_fold
 from scene.writing import unrolled
 from scene.writing.unrolled import Sheet, Unrolled
@@ -70,7 +70,8 @@ def split_lining(lining: trimesh.Trimesh, bore: Bore, length: float) -> list[tri
 def _require_unfolded(bore: Bore) -> None:
     fold = find_fold(bore)
     if fold is not None:
-        raise FitError(f"the sections fold into each other at {fold:.1f} m; is the curve too tight for the width?")
+        why = f"the sections fold into each other at {fold:.1f} m; is the curve too tight for the width?"
+        raise FitError(why, Refusal.FOLDED)
 
 
 def _pocket_rectangles(bore: Bore, plane: Unrolled) -> tuple[Float[np.ndarray, "p 4"], Bool[np.ndarray, " p"]]:

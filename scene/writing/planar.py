@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from manifold3d import Manifold, Mesh64
 
-from scene.bore import Axis, Bore, make_axis
+from scene.bore import Bore
 from scene.errors import FitError
 from scene.writing.mesh import has_rings
 from subterra_jax.host.tunnelfile import write_tunnel
@@ -42,7 +42,7 @@ def cut_walls(solid: Manifold, bore: Bore, elevation: Float[np.ndarray, " n"], h
     if not polygons:
         raise FitError(f"no wall {height:g} m above the track: the bore is not that high there")
     outline = max(polygons, key=_area)
-    plan = flatten_axis(axis)
+    plan = axis.in_plan()
     along, across, _ = plan.local(np.column_stack([outline, np.zeros(len(outline))]))
     left, right = across > 0, across <= 0
     if left.sum() < 2 or right.sum() < 2:
@@ -61,17 +61,9 @@ def cut_walls(solid: Manifold, bore: Bore, elevation: Float[np.ndarray, " n"], h
     )
 
 
-def flatten_axis(axis: Axis) -> Axis:
-    """Return the axis in plan, at its own stations."""
-    tangent = axis.tangent * [1.0, 1.0, 0.0]
-    return make_axis(
-        axis.station, axis.position * [1.0, 1.0, 0.0], tangent / np.linalg.norm(tangent, axis=1, keepdims=True)
-    )
-
-
 def half_widths(walls: Walls, bore: Bore) -> Float[np.ndarray, " n"]:
     """Return half the distance of the walls at each station, m."""
-    plan = flatten_axis(bore.axis)
+    plan = bore.axis.in_plan()
 
     def across(wall: np.ndarray, station: np.ndarray) -> np.ndarray:
         return np.interp(bore.station, station, plan.local(np.column_stack([wall, np.zeros(len(wall))]))[1])
@@ -118,7 +110,7 @@ def save_tunnel(
         shell: Fields of `scene.writing.shell`; without them and `seams` the file holds the plane alone.
         seams: The same.
     """
-    plan = flatten_axis(bore.axis)
+    plan = bore.axis.in_plan()
     facts = {
         "name": name,
         "provenance": provenance,

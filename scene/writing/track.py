@@ -119,7 +119,7 @@ def lay_track(bore: Bore, config: TrackConfig, seen: SeenTrack | None = None) ->
     without such rails it raises `FitError`.
     """
     half_width = config.sleeper_length / 2 + config.shoulder
-    floor = bore.position[:, 2] - _radius_down(bore) * bore.up[:, 2]
+    floor = bore.position[:, 2] - bore.toward(-np.pi / 2) * bore.up[:, 2]
     chord = bore.position[:, 2] + _lowest_chord(bore, half_width)
     sought = config.lay == "auto" and seen is not None and seen.sought
     lines = seen.lines if seen is not None and sought else (SeenLine(None, None),)
@@ -168,8 +168,7 @@ def _lay_line(bore: Bore, config: TrackConfig, bed: np.ndarray, seen: SeenLine) 
     seat = bed + protrusion
     level = seat - bore.position[:, 2]
     nearer = np.minimum(wall_offset(bore, level, 1) - offset, wall_offset(bore, level, -1) + offset)
-    row = np.clip(np.rint(station / bore.station[1]).astype(int), 0, count - 1)
-    clearance = nearer[row] - config.sleeper_length / 2
+    clearance = nearer[bore.row_of(station)] - config.sleeper_length / 2
     fits = clearance >= config.margin
     if not fits.all() and rails is None:
         worst = int(np.argmin(clearance))
@@ -187,10 +186,6 @@ def _lay_line(bore: Bore, config: TrackConfig, bed: np.ndarray, seen: SeenLine) 
     )  # fmt: skip
 
 
-def _radius_down(bore: Bore) -> np.ndarray:
-    return np.array([np.interp(-np.pi / 2, bore.angle, radius, period=2 * np.pi) for radius in bore.radius])
-
-
 def _wall_at(bore: Bore, row: int, height: float | np.ndarray, side: int) -> np.ndarray:
     """Distance from the axis to the wall on one side at a height above the axis, m."""
     across, upward = side * bore.radius[row] * np.cos(bore.angle), bore.radius[row] * np.sin(bore.angle)
@@ -201,7 +196,7 @@ def _wall_at(bore: Bore, row: int, height: float | np.ndarray, side: int) -> np.
 
 def _lowest_chord(bore: Bore, half_width: float) -> np.ndarray:
     """Lowest height above the axis, m, at which both walls are at least `half_width` away; 0 where none is."""
-    down = -_radius_down(bore)
+    down = -bore.toward(-np.pi / 2)
     levels = np.zeros(len(bore.station))
     for row in range(len(bore.station)):
         grid = np.linspace(down[row], 0.0, 300)

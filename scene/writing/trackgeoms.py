@@ -7,7 +7,8 @@ import trimesh
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from scene.bore import Axis, Bore
+from scene.bore import Bore
+from scene.geometry import Axis
 from scene.writing import markup
 from scene.writing.markup import DECK, GROUND, SOLID, SceneParts, add_box, add_element
 from scene.writing.track import Line, RailProfile, Track, TrackConfig

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import Delaunay
 
 from scene.bore import Bore
+from scene.geometry import arc_length
 
 _LID_OVERLAP = 0.05  # how far a box reaches into the air, so that a union leaves no film
 
@@ -39,8 +40,7 @@ def _point(bore: Bore, row: np.ndarray, column: np.ndarray) -> np.ndarray:
 def wall_normals(bore: Bore, pocket: Int[np.ndarray, " r"]) -> Float[np.ndarray, "r 3"]:
     """Return outward unit normals of the wall at some pockets, over an arc of about 5°."""
     m = len(bore.angle)
-    row = np.rint(bore.pocket["station"][pocket] / (bore.station[1] - bore.station[0])).astype(int)
-    row = np.clip(row, 0, len(bore.station) - 1)
+    row = bore.row_of(bore.pocket["station"][pocket])
     turn = (bore.pocket["angle"][pocket] - bore.angle[0]) / (2 * np.pi) * m
     column, reach = np.rint(turn).astype(int), max(1, m // 144)
     normal = np.cross(
@@ -119,7 +119,7 @@ def unroll_section(bore: Bore) -> Unrolled:
     )
     angle = np.concatenate([[0.0], turn, [2 * np.pi]]) + seam
     outline = mean[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
-    around = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(outline, axis=0), axis=1))])
+    around = arc_length(outline)
     return Unrolled(around, angle)
 
 

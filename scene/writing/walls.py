@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from shapely import LineString, Point
 
 from scene.bore import Bore
+from scene.geometry import arc_length
 from scene.writing.markup import LOW_WALL, SOLID, add_box, cross_product, rotation_along
 from scene.writing.planar import Walls
 from scene.writing.track import Track
@@ -154,7 +155,7 @@ def add_low_panels(world: ET.Element, walls: Walls, bore: Bore, track: Track, ni
     ):
         line = LineString(wall)
         vertices = np.asarray(line.simplify(_LINE_TOLERANCE).coords)
-        arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(wall, axis=0), axis=1))])
+        arc = arc_length(wall)
         vertex_station = np.interp([line.project(Point(vertex)) for vertex in vertices], arc, station)
         gaps = niches if side == 1 else []
         cut = np.array([end for gap in gaps for end in gap])

@@ -1,11 +1,19 @@
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
-from scene.bore import POCKET, STATION_STEP, Bore, axis_through
+from scene.bore import POCKET, STATION_STEP, Bore
 from scene.fitting.assemble import measure_extents
-from scene.fitting.profile import N_ANGLES, section_angles
+from scene.geometry import N_ANGLES, axis_through, section_angles
+from scene.writing.folder import write_geometry
+from scene.writing.furniture import FurnitureConfig
+from scene.writing.mjcf import SceneConfig
+from scene.writing.track import Track, TrackConfig, lay_track
+from tests.scene.clouds import curved_d_bore
 
 
 def arc_bore(length: float = 24.0, radius: float = 60.0, grade: float = 0.01, half_width: float = 2.8) -> Bore:
@@ -34,3 +42,27 @@ def arc_bore(length: float = 24.0, radius: float = 60.0, grade: float = 0.01, ha
 @pytest.fixture(scope="session")
 def bore() -> Bore:
     return arc_bore()
+
+
+ORIGIN = [271_000.0, 2_103_000.0, -17.0]
+
+
+@pytest.fixture(scope="session")
+def arc_scene(bore, tmp_path_factory) -> tuple[Path, Track, dict[str, int]]:
+    """The scene folder of the arc with niches, its track, and the number of each asset in it."""
+    folder = tmp_path_factory.mktemp("built") / "arc"
+    folder.mkdir()
+    laid = lay_track(bore, TrackConfig())
+    config = SceneConfig(furniture=FurnitureConfig(passage_spacing=12.0, plate_spacing=8.0))
+    count, _ = write_geometry(folder, "arc", "simulated", bore, laid, config)
+    manifest = {"name": "arc", "input_provenance": "simulated", "frame": {"origin": ORIGIN}}
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    return folder, laid, count
+
+
+@pytest.fixture(scope="session")
+def bore_file(tmp_path_factory) -> Path:
+    """A cloud of 24 m of a curved D-shaped bore."""
+    path = tmp_path_factory.mktemp("cloud") / "bore.ply"
+    trimesh.PointCloud(curved_d_bore(length=24, per_metre=4000, offset=(12.0, -3.0, 2.0)).points).export(path)
+    return path

@@ -7,7 +7,6 @@ import trimesh
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
-from scene.cloud import Cloud, VoxelMean
 from tests.scene.shapes import PLACE
 
 Box = tuple[float, float, float, float, float, float]  # x, y, z from and to, m
@@ -105,9 +104,3 @@ def carried(length: float, height: float, step: float, aside: float = 0.1) -> np
 def stations(length: float, height: float = 1.6, step: float = 6.0) -> np.ndarray:
     x = np.arange(2.0, length - 1.0, step)
     return np.column_stack([x, np.full_like(x, 0.05), np.full_like(x, height)])
-
-
-def thinned(points: np.ndarray, voxel: float = 0.04) -> Cloud:
-    voxels = VoxelMean(voxel)
-    voxels.add(points)
-    return voxels.cloud()

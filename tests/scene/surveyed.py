@@ -1,4 +1,4 @@
-"""Readers of simulated surveys for the tests, which share nothing with what wrote them."""
+"""Simulated surveys, and readers of them that share nothing with what wrote them."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,6 +9,8 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation, Slerp
+
+from scene.survey.__main__ import main
 
 Cast = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
@@ -22,6 +24,12 @@ class Trajectory:
     def at(self, time: np.ndarray) -> tuple[np.ndarray, Rotation]:
         position = np.stack([np.interp(time, self.time, p) for p in self.position.T], axis=-1)
         return position, Slerp(self.time, self.attitude)(time)
+
+
+def survey(out: Path, *words: object) -> Path:
+    """Writes a survey by the command, which must succeed; returns its folder."""
+    assert main([*map(str, words), "--out", str(out)]) == 0
+    return out
 
 
 def read_tum(path: Path) -> tuple[np.ndarray, np.ndarray]:

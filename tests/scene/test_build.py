@@ -30,17 +30,9 @@ def command(monkeypatch, capsys):
 
 
 @pytest.fixture(scope="module")
-def cloud_file(tmp_path_factory):
-    path = tmp_path_factory.mktemp("cloud") / "bore.ply"
-    known = curved_d_bore(length=24, per_metre=6000, offset=(12.0, -3.0, 2.0))
-    trimesh.PointCloud(known.points).export(path)
-    return path
-
-
-@pytest.fixture(scope="module")
-def scene(cloud_file, tmp_path_factory):
+def scene(bore_file, tmp_path_factory):
     out = tmp_path_factory.mktemp("out") / "bore"
-    build(cloud_file, out)
+    build(bore_file, out)
     return out
 
 
@@ -103,8 +95,8 @@ def test_the_scene_loads_into_mjx_and_steps(scene):
     assert np.isfinite(np.asarray(data.qpos)).all()
 
 
-def test_the_same_input_gives_the_same_bytes(cloud_file, scene, tmp_path):
-    build(cloud_file, tmp_path / "bore")
+def test_the_same_input_gives_the_same_bytes(bore_file, scene, tmp_path):
+    build(bore_file, tmp_path / "bore")
     for path in sorted(scene.rglob("*")):
         if path.is_file():
             assert path.read_bytes() == (tmp_path / "bore" / path.relative_to(scene)).read_bytes(), path.name
@@ -177,11 +169,11 @@ def test_bad_input_is_one_sentence_status_2_and_no_output(case, inputs, tmp_path
     assert not list(tmp_path.iterdir())
 
 
-def test_an_output_that_is_a_file_is_refused_before_any_work(cloud_file, tmp_path, command):
+def test_an_output_that_is_a_file_is_refused_before_any_work(bore_file, tmp_path, command):
     blocked = tmp_path / "file"
     blocked.write_text("mine")
     for out in (blocked, blocked / "below"):
-        status, told = command(cloud_file, "--out", out)
+        status, told = command(bore_file, "--out", out)
         assert status == 2
         assert f"{blocked}: is a file" in told
     assert blocked.read_text() == "mine"

@@ -8,9 +8,8 @@ from scene.fitting import pockets, trackseen
 from scene.fitting.evidence import more_than_chance, steadier_than_chance
 from scene.fitting.section import fit_sections
 from tests.scene.clouds import curved_d_bore
-from tests.scene.fits import axis_of
+from tests.scene.fits import axis_of, thin
 from tests.scene.scanned import arch, pillar, scan, with_outliers
-from tests.scene.test_reconstruction import thin
 
 PITCHES = (0.9, 2.1)
 

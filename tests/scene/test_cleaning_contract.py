@@ -3,23 +3,22 @@
 import numpy as np
 import pytest
 
-from scene.bore import axis_through
-from scene.cleaning.clean import CleaningConfig, clean_cloud
 from scene.cleaning.removed import Cause, list_removed
 from scene.cloud import Cloud
-from scene.fitting.centreline import CentrelineConfig, section_middles
+from scene.fitting.centreline import section_middles
 from scene.fitting.section import visible_span
+from scene.geometry import axis_through
 from tests.scene.clouds import curved_d_bore
-from tests.scene.test_reconstruction import thin
+from tests.scene.fits import cleaned, thin
 
 
 def test_a_clean_cloud_is_handed_on_as_it_is():
     cloud = thin(curved_d_bore(length=20).points)
-    cleaned = clean_cloud(cloud, CleaningConfig(), CentrelineConfig())
-    assert cleaned.cloud is cloud
-    assert cleaned.removed == ()
-    assert not cleaned.cause.any()
-    assert len(cleaned.cause) == len(cloud.points)
+    result = cleaned(cloud)
+    assert result.cloud is cloud
+    assert result.removed == ()
+    assert not result.cause.any()
+    assert len(result.cause) == len(cloud.points)
 
 
 def test_what_was_removed_is_listed_by_stretch_with_its_place_in_the_frame_of_the_input():

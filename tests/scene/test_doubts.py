@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from scene.bore import STATION_STEP, Bore, axis_through
+from scene.bore import STATION_STEP, Bore
 from scene.build import build
 from scene.cleaning.crop import ExtentConfig
 from scene.config import BuildConfig, ReconstructConfig
+from scene.geometry import axis_through
 from scene.judging.judge import DoubtError, JudgingConfig, judge_bore
 from scene.judging.layers import doubt_layers
 from scene.judging.page import render_page

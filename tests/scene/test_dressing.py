@@ -4,21 +4,14 @@ import mujoco
 import numpy as np
 import pytest
 
-from scene.writing import mjcf
 from scene.writing.dressing import LIT, ballast_picture, concrete_picture, write_png
 from scene.writing.mesh import as_trimesh, build_solid, has_rings, open_lining, split_skin
-from scene.writing.planar import cut_walls
-from scene.writing.track import TrackConfig, lay_track
 
 
 @pytest.fixture(scope="module")
-def written(bore, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("dressing")
-    laid, solid = lay_track(bore, TrackConfig()), build_solid(bore, pockets=True)
-    lining = open_lining(as_trimesh(solid), bore)
-    walls = cut_walls(solid, bore, laid.elevation, 0.7)
-    mjcf.write_scene(folder, "x", bore, lining, walls, laid, mjcf.SceneConfig())
-    return laid, lining, mujoco.MjModel.from_xml_path(str(folder / "scene.xml"))
+def written(bore, arc_scene):
+    lining = open_lining(as_trimesh(build_solid(bore, pockets=True)), bore)
+    return arc_scene[1], lining, mujoco.MjModel.from_xml_path(str(arc_scene[0] / "scene.xml"))
 
 
 def test_a_picture_is_read_back_as_it_was_written(tmp_path):

@@ -8,25 +8,16 @@ import numpy as np
 import pytest
 import trimesh
 
-from scene.bore import Bore
 from scene.export import main
-from scene.writing.folder import write_geometry
-from scene.writing.mjcf import SceneConfig
-from scene.writing.track import TrackConfig, lay_track
+from tests.scene.conftest import ORIGIN
 
 GROUPS = np.array([1, 1, 0, 0, 0, 0], np.uint8)
 N = 10_000  # rays
-ORIGIN = np.array([271_000.0, 2_103_000.0, -17.0])
 
 
 @pytest.fixture(scope="module")
-def scene(bore: Bore, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("built") / "arc"
-    (folder / "meshes").mkdir(parents=True)
-    write_geometry(folder, "arc", "simulated", bore, lay_track(bore, TrackConfig()), SceneConfig())
-    manifest = {"name": "arc", "input_provenance": "simulated", "frame": {"origin": ORIGIN.tolist()}}
-    (folder / "manifest.json").write_text(json.dumps(manifest))
-    return folder
+def scene(arc_scene):
+    return arc_scene[0]
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +63,7 @@ def load_usd(path) -> trimesh.Trimesh:
     assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0
     facts = stage.GetDefaultPrim().GetCustomData()
     assert facts["subterra_provenance"] == "simulated"
-    assert json.loads(facts["subterra_origin"]) == ORIGIN.tolist()
+    assert json.loads(facts["subterra_origin"]) == ORIGIN
     meshes = []
     for prim in stage.Traverse():
         if prim.IsA(UsdGeom.Mesh):

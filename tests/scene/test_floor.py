@@ -5,11 +5,10 @@ import pytest
 
 from scene.bore import Bore
 from scene.fitting import floor
-from scene.fitting.assemble import bore_from_sections
 from scene.fitting.section import fit_sections
 from tests.scene import railway
-from tests.scene.fits import axis_of
-from tests.scene.railway import World, arch, thinned
+from tests.scene.fits import axis_of, fitted, thin
+from tests.scene.railway import World, arch
 from tests.scene.shapes import PLACE
 
 L = 26.0
@@ -34,11 +33,9 @@ SCANS = {
 
 def built(points: np.ndarray, voxel: float) -> tuple[Bore, np.ndarray]:
     """The bore, and how much its floor on the axis lies too high at each station, m."""
-    cloud = thinned(points, voxel)
-    axis = axis_of(cloud)
-    bore = bore_from_sections(axis, fit_sections(cloud, axis))
-    down = np.array([np.interp(-np.pi / 2, bore.angle, radius, period=2 * np.pi) for radius in bore.radius])
-    foot = bore.position - down[:, None] * bore.up + cloud.origin - PLACE
+    cloud = thin(points, voxel)
+    bore = fitted(cloud)[0]
+    foot = bore.position - bore.toward(-np.pi / 2)[:, None] * bore.up + cloud.origin - PLACE
     return bore, foot[:, 2] - 0.01 * foot[:, 0]
 
 
@@ -121,7 +118,7 @@ def test_a_walkway_stays_beside_the_floor_and_what_stands_there_for_a_metre_goes
 def test_a_round_invert_is_no_floor():
     turn = np.linspace(-np.pi, np.pi, 200)[:-1]
     tube = World(np.column_stack([2.7 * np.cos(turn), 2.7 + 2.7 * np.sin(turn)]), L)
-    cloud = thinned(SCANS["vlp16"](tube))
+    cloud = thin(SCANS["vlp16"](tube))
     axis = axis_of(cloud)
     assert not fit_sections(cloud, axis).flat_floor
 

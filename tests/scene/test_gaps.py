@@ -3,15 +3,13 @@
 import numpy as np
 import pytest
 
-from scene.bore import axis_through
-from scene.cleaning.clean import CleaningConfig, clean_cloud
 from scene.fitting import section
-from scene.fitting.assemble import bore_from_sections, find_fold, fit_unfolded
-from scene.fitting.centreline import CentrelineConfig
-from scene.fitting.gaps import fill_sides
-from scene.fitting.section import fit_sections
+from scene.fitting.assemble import find_fold, fit_unfolded
+from scene.fitting.unroll import fill_sides
+from scene.geometry import axis_through
 from tests.scene import railway
-from tests.scene.railway import World, arch, thinned
+from tests.scene.fits import bore_about, cleaned, thin
+from tests.scene.railway import World, arch
 from tests.scene.shapes import PLACE
 
 L = 18.0
@@ -47,12 +45,10 @@ def test_a_wall_goes_on_to_an_end_as_it_was_before_and_no_further_than_told():
 def test_the_bore_keeps_its_width_where_a_scan_ends_aslant(monkeypatch):
     points = ARCH.scan(railway.terrestrial(), railway.stations(L), 0.004) - PLACE
     unseen = (points[:, 1] > -1.0) & (points[:, 0] > L - 0.9 - 0.2 * points[:, 1])
-    cleaned = clean_cloud(thinned(points[~unseen] + PLACE, 0.07), CleaningConfig(), CentrelineConfig())
+    bore = cleaned(thin(points[~unseen] + PLACE, 0.07))
 
     def off() -> float:
-        return float(
-            np.abs(bore_from_sections(cleaned.axis, fit_sections(cleaned.cloud, cleaned.axis)).width - 5.5).max()
-        )
+        return float(np.abs(bore_about(bore.axis, bore.cloud).width - 5.5).max())
 
     assert off() < 0.03
     monkeypatch.setattr(section, "_GOES_ON", 0.0)
@@ -62,10 +58,10 @@ def test_the_bore_keeps_its_width_where_a_scan_ends_aslant(monkeypatch):
 def test_a_wall_that_nobody_saw_stands_straight_between_crown_and_floor(monkeypatch):
     points = ARCH.scan(railway.terrestrial(), railway.stations(L), 0.004) - PLACE
     unseen = (points[:, 1] > 2.70) & (points[:, 2] - 0.01 * points[:, 0] < 3.2)
-    cleaned = clean_cloud(thinned(points[~unseen] + PLACE, 0.07), CleaningConfig(), CentrelineConfig())
+    bore = cleaned(thin(points[~unseen] + PLACE, 0.07))
 
     def width() -> np.ndarray:
-        return bore_from_sections(cleaned.axis, fit_sections(cleaned.cloud, cleaned.axis)).width[8:-8]
+        return bore_about(bore.axis, bore.cloud).width[8:-8]
 
     assert np.abs(width() - 5.5).max() < 0.10
     monkeypatch.setattr(section, "fill_sides", lambda wall, angle, reach: wall)
@@ -73,12 +69,12 @@ def test_a_wall_that_nobody_saw_stands_straight_between_crown_and_floor(monkeypa
 
 
 def test_an_axis_that_bends_so_sharply_that_sections_fold_is_smoothed():
-    cloud = thinned(ARCH.scan(railway.terrestrial(), railway.stations(L), 0.004), 0.07)
+    cloud = thin(ARCH.scan(railway.terrestrial(), railway.stations(L), 0.004), 0.07)
     along = np.arange(0.0, L + 0.1, 0.5)
     jump = 0.9 / (1.0 + np.exp((L / 2 - along) / 0.12))  # as at the end of a platform
     path = np.column_stack([along, jump - 0.4, 2.9 + 0.01 * along]) + PLACE - cloud.origin
     axis = axis_through(path, 0.25)
-    assert find_fold(bore_from_sections(axis, fit_sections(cloud, axis))) is not None
+    assert find_fold(bore_about(axis, cloud)) is not None
     _, bore = fit_unfolded(cloud, axis, 12.0)
     assert find_fold(bore) is None
     assert np.abs(bore.axis.curvature).max() < 0.3

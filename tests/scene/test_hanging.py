@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from scene.cleaning.hanging import bridge_hanging
+from scene.cleaning.tube import bridge_hanging
 
 ANGLE = -np.pi + 2 * np.pi * (np.arange(120) + 0.5) / 120
 

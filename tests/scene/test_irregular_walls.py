@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter
 
 from scene.bore import Bore
 from scene.fitting.kriging import Correlation, choose_correlation, predict_wall
-from tests.scene.test_reconstruction import rebuilt
+from tests.scene.fits import rebuilt
 
 LENGTH, SPACING, STEP, COLUMNS = 30.0, 1.0, 0.1, 180
 SD = 0.13
@@ -74,12 +74,7 @@ def linear(tunnel: Irregular, profiles: np.ndarray, held: np.ndarray, wall: np.n
 
 @pytest.mark.parametrize(
     ("correlation", "mean", "within"),
-    [
-        # Since the axis comes from what cleaning followed it is 4.6 cm and 0.895: to be mended, not to be allowed.
-        pytest.param(1.0, 0.040, 0.94, marks=pytest.mark.xfail(strict=True, reason="rougher since one axis finder")),
-        (2.0, 0.012, 0.99),
-        (4.0, 0.008, 0.99),
-    ],
+    [(1.0, 0.040, 0.94), (2.0, 0.012, 0.99), (4.0, 0.008, 0.99)],
 )
 def test_profiles_a_metre_apart_give_the_wall_between_them(correlation, mean, within):
     tunnel, rng = Irregular.drawn(correlation, seed=4), np.random.default_rng(8)

@@ -10,10 +10,9 @@ from scene.cloud import Cloud
 from scene.fitting.assemble import bore_from_sections
 from scene.fitting.lining import LiningConfig, add_lining, add_standard_lining, count_alone, make_nails, pair_pockets
 from scene.fitting.section import fit_sections
-from tests.scene.fits import axis_of
+from tests.scene.fits import axis_of, thin
 from tests.scene.shapes import swept
 from tests.scene.test_irregular_walls import Irregular
-from tests.scene.test_reconstruction import thin
 
 RADIUS, LENGTH, RING = 2.75, 18.0, 1.5
 JOINTS = np.arange(0.75, LENGTH, RING)

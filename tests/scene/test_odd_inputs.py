@@ -90,9 +90,9 @@ def test_a_ptx_of_two_scans_is_read_in_one_frame_without_its_empty_directions(tm
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda text: text[:4000], r"line \d+ holds no point|it ends at line \d+, \d+ points before its header says"),
+        (lambda text: text[:4000], r"line \d+ has no numbers|it ends \d+ of \d+ points before a scan's header says"),
         (lambda text: text.replace("1 0 0", "one 0 0", 1), "lines 1 to 10 are no header of a PTX scan"),
-        (lambda text: text.replace(" 0.5", "x", 1).replace(".", "?", 40), "lines 1 to 10|line 11 holds no point"),
+        (lambda text: text.replace(" 0.5", "x", 1).replace(".", "?", 40), "lines 1 to 10|line 11 has no numbers"),
     ],
 )
 def test_a_damaged_ptx_is_named_with_its_line(tmp_path, change, said):

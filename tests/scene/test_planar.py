@@ -5,7 +5,7 @@ import pytest
 
 from scene.bore import NAIL
 from scene.writing.mesh import build_solid
-from scene.writing.planar import cut_walls, flatten_axis, half_widths, ring_pitch, save_tunnel
+from scene.writing.planar import cut_walls, half_widths, ring_pitch, save_tunnel
 from scene.writing.track import TrackConfig, lay_track
 
 
@@ -27,13 +27,13 @@ def test_smooth_walls_run_at_half_the_width_over_the_whole_length(bore, walls):
 
 
 def test_left_is_left_of_the_centreline(bore, walls):
-    plan = flatten_axis(bore.axis)
+    plan = bore.axis.in_plan()
     for wall, side in ((walls["smooth"].left, 1), (walls["smooth"].right, -1)):
         assert (side * plan.local(np.column_stack([wall, np.zeros(len(wall))]))[1] > 2.7).all()
 
 
 def test_pockets_are_recesses_of_13_cm_with_upright_sides(bore, walls):
-    plan = flatten_axis(bore.axis)
+    plan = bore.axis.in_plan()
     wall = walls["pockets"].left
     across = plan.local(np.column_stack([wall, np.zeros(len(wall))]))[1]
     assert across.max() == pytest.approx(2.93, abs=0.01)

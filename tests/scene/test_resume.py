@@ -109,7 +109,7 @@ def test_a_registration_that_is_killed_ends_on_the_same_bits(bag, tmp_path, caps
         np.testing.assert_array_equal(getattr(again.cloud, name), getattr(whole.cloud, name))
 
 
-def test_a_cloud_file_goes_on_behind_the_chunks_that_were_thinned(tmp_path, capsys):
+def test_a_bore_file_goes_on_behind_the_chunks_that_were_thinned(tmp_path, capsys):
     points = np.random.default_rng(0).uniform(-9, 9, (1_200_000, 3)).astype(np.float32)
     trimesh.PointCloud(points).export(tmp_path / "c.ply")
     whole, facts = read_cloud(tmp_path / "c.ply", 0.5)
@@ -221,13 +221,6 @@ def test_a_folder_is_replaced_and_a_half_done_replacement_is_put_right(tmp_path,
     assert [entry.name for entry in tmp_path.iterdir()] == ["out"]
 
 
-@pytest.fixture(scope="module")
-def cloud_file(tmp_path_factory):
-    path = tmp_path_factory.mktemp("cloud") / "bore.ply"
-    trimesh.PointCloud(curved_d_bore(length=24, per_metre=6000).points).export(path)
-    return path
-
-
 def start(*arguments: object, limit: int | None = None) -> subprocess.Popen:
     def limited() -> None:
         if limit is not None:
@@ -244,11 +237,11 @@ def start(*arguments: object, limit: int | None = None) -> subprocess.Popen:
 
 
 @pytest.mark.slow
-def test_a_kill_while_writing_and_a_full_disk_leave_the_previous_output_whole(cloud_file, tmp_path):
+def test_a_kill_while_writing_and_a_full_disk_leave_the_previous_output_whole(bore_file, tmp_path):
     out = tmp_path / "scene"
     out.mkdir()
     (out / "scene.xml").write_text("mine")
-    build = start(cloud_file, "--out", out, "--keep-every", "0")
+    build = start(bore_file, "--out", out, "--keep-every", "0")
     while build.poll() is None and not (tmp_path / ".scene.partial" / "scene.xml").exists():
         time.sleep(0.005)
     build.send_signal(signal.SIGKILL)
@@ -256,13 +249,13 @@ def test_a_kill_while_writing_and_a_full_disk_leave_the_previous_output_whole(cl
     assert (out / "scene.xml").read_text() == "mine"
     assert partial_folder(out).exists()
 
-    full = start(cloud_file, "--out", out, limit=100_000)  # bytes a file
+    full = start(bore_file, "--out", out, limit=100_000)  # bytes a file
     said, error = full.communicate(timeout=120)
     assert full.returncode == 2, error
     assert re.fullmatch(rf"error: {re.escape(str(out))}: cannot be written \(.*\)\n", error), error
     assert (out / "scene.xml").read_text() == "mine"
 
-    done = start(cloud_file, "--out", out)
+    done = start(bore_file, "--out", out)
     said, error = done.communicate(timeout=120)
     assert done.returncode == 0, error
     assert (out / "scene.xml").read_text() != "mine"

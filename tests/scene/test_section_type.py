@@ -5,8 +5,8 @@ import pytest
 
 from scene.bore import load_bore
 from tests.scene.clouds import curved_d_bore
+from tests.scene.fits import rebuilt
 from tests.scene.shapes import swept
-from tests.scene.test_reconstruction import rebuilt
 
 
 @pytest.mark.parametrize(

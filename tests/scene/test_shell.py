@@ -7,7 +7,6 @@ import pytest
 from scipy.spatial import cKDTree
 
 from scene.writing.folder import write_geometry
-from scene.writing.furniture import FurnitureConfig
 from scene.writing.mjcf import SceneConfig
 from scene.writing.track import TrackConfig, lay_track
 from subterra_jax.host.errors import TunnelError
@@ -20,12 +19,9 @@ LININGS = ("smooth", "pockets", "furnished")
 
 
 @pytest.fixture(scope="module")
-def built(bore, tmp_path_factory):
+def built(arc_scene):
     """A scene folder with niches, and its plan."""
-    folder = tmp_path_factory.mktemp("built")
-    config = SceneConfig(furniture=FurnitureConfig(passage_spacing=12.0, plate_spacing=8.0))
-    write_geometry(folder, "arc", "simulated", bore, lay_track(bore, TrackConfig()), config)
-    return folder, load_tunnel(folder / "tunnel.npz")
+    return arc_scene[0], load_tunnel(arc_scene[0] / "tunnel.npz")
 
 
 def spoiled(folder, target, **changed):

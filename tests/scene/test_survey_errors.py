@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scene.survey.__main__ import main
 from scene.survey.cast import PULSE, Caster, Hits, draw_returns, mix_pixels, noise_sigma
 from scene.survey.config import SensorErrors
 from scene.survey.lidar import Lidar, os1, vlp16
@@ -113,26 +112,3 @@ def test_every_imu_is_mounted_by_a_rotation() -> None:
         for imu in imus:
             np.testing.assert_allclose(imu.mount.rotation @ imu.mount.rotation.T, np.eye(3), atol=1e-12)
             assert np.linalg.det(imu.mount.rotation) == pytest.approx(1.0)
-
-
-@pytest.mark.parametrize(
-    ("args", "reason"),
-    [
-        (["--truth", "metro", "--length", "352"], "length must be at most 351 m for truth metro"),
-        (["--truth", "irregular", "--correlation", "0.5"], "correlation must lie between 1 and 4 m"),
-        (["--scan-every", "0"], "scan_every must be at least 1"),
-        (["--sensors", "avia", "avia"], "sensors must differ"),
-        (["--profiles", "50"], "profiles must lie between 0.1 m and half the length"),
-        (["--cloud", "--sensors"], "cloud needs a sensor"),
-        (["--cloud", "--profiles", "1"], "cloud needs a sensor"),
-        (["--errors.lost", "1.5"], "errors.lost must lie between 0 and 1"),
-        (["--errors.range-noise", "nan"], "errors.range_noise must not be negative"),
-    ],
-)
-def test_a_wrong_value_is_refused_in_one_sentence(
-    args: list[str], reason: str, tmp_path: object, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["--out", f"{tmp_path}/out", *args]) == 2
-    told = capsys.readouterr().err
-    assert told.startswith(f"error: {reason}")
-    assert told.count("\n") == 1

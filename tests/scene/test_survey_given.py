@@ -17,6 +17,7 @@ from scene.survey.rolled import Sheet, place_recesses, wall_mesh
 from subterra_jax.host.errors import TunnelError
 from subterra_jax.lidar3d.rolled import raise_shell
 from subterra_jax.procedural.open_world import draw, plan
+from tests.scene import surveyed
 from tests.scene.surveyed import frames, load_cast, load_trajectory
 from tests.subterra_jax import tunnels
 
@@ -25,6 +26,7 @@ KINDS = {
     "rock": "test-unseen",
 }  # fmt: skip
 LENGTH = 40.0
+WORDS = ("--length", 20, "--seed", 5, "--point-rate", 24_000, "--truth-file")
 
 
 def name_of(kind: str) -> str:
@@ -48,10 +50,7 @@ def universal(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def survey(universal: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("survey")
-    words = ["--truth-file", universal, "--length", 20, "--seed", 5, "--point-rate", 24_000, "--out", out]
-    assert main([str(word) for word in words]) == 0
-    return out
+    return surveyed.survey(tmp_path_factory.mktemp("survey"), *WORDS, universal)
 
 
 def cast(vertices: np.ndarray, faces: np.ndarray, start: np.ndarray, ray: np.ndarray) -> np.ndarray:
@@ -117,8 +116,7 @@ def test_returns_lie_on_the_truth_and_pockets_are_where_they_were_drawn(survey: 
 
 
 def test_the_same_seed_gives_the_same_bytes(universal: Path, survey: Path, tmp_path: Path) -> None:
-    words = ["--truth-file", universal, "--length", 20, "--seed", 5, "--point-rate", 24_000, "--out", tmp_path]
-    assert main([str(word) for word in words]) == 0
+    surveyed.survey(tmp_path, *WORDS, universal)
     for path in survey.iterdir():
         assert path.read_bytes() == (tmp_path / path.name).read_bytes(), path.name
 

@@ -10,13 +10,11 @@ import trimesh
 from plyfile import PlyData
 from scipy.spatial import cKDTree
 
-from scene.survey.__main__ import main
-from scene.survey.bore import draw_bore
 from scene.survey.cast import draw_strays
 from scene.survey.config import TruthName
 from scene.survey.mesh import Part
-from tests.scene.surveyed import frames, load_trajectory
-from tests.scene.test_survey_truths import TYPES
+from tests.scene.surveyed import frames, load_trajectory, survey
+from tests.scene.test_survey_truths import SHELL, TYPES
 
 LENGTH = 18.0
 SIZES = {
@@ -24,7 +22,6 @@ SIZES = {
     "road": (9.6, 7.0), "slabtrack": (5.1, 5.5),
 }  # fmt: skip
 TRACKS = {"portal": [2.0, -2.0], "corridor": [], "road": []}
-SHELL = (Part.LINING, Part.JOINT, Part.POCKET, Part.FLOOR, Part.DARK)
 
 
 def test_every_truth_is_tested_here_or_with_the_bare_bores() -> None:
@@ -34,8 +31,7 @@ def test_every_truth_is_tested_here_or_with_the_bare_bores() -> None:
 @pytest.fixture(scope="module", params=SIZES)
 def place(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path, dict]:
     folder = tmp_path_factory.mktemp(request.param)
-    words = ["--truth", request.param, "--length", LENGTH, "--seed", 4, "--out", folder, "--sensors"]
-    assert main([str(word) for word in words]) == 0
+    survey(folder, "--truth", request.param, "--length", LENGTH, "--seed", 4, "--sensors")
     return request.param, folder, json.loads((folder / "truth.json").read_text())
 
 
@@ -113,30 +109,10 @@ def test_tracks_and_things_stand_where_the_truth_says(place: tuple[str, Path, di
         assert name != "works" or max(sizes) == pytest.approx(0.3 * LENGTH)
 
 
-@pytest.mark.parametrize("name", SIZES)
-def test_every_surface_of_a_place_faces_the_air(name: TruthName) -> None:
-    bore = draw_bore(np.random.SeedSequence(2), 15.0, name)
-    mesh = bore.mesh()
-    origin = mesh.vertices.mean(axis=0)
-    for solid in (Part.SLEEPER, Part.RAIL, Part.FASTENING, Part.THING):
-        one = trimesh.Trimesh(mesh.vertices - origin, mesh.faces[mesh.part == solid])
-        assert not len(one.faces) or (one.is_watertight and one.is_winding_consistent and one.volume > 0)
-    shell = trimesh.Trimesh(mesh.vertices - origin, mesh.faces[np.isin(mesh.part, SHELL)])
-    assert shell.is_winding_consistent
-    assert shell.volume < 0
-    ground = mesh.part == Part.TERRAIN
-    assert ground.any() == (name == "portal")
-    if name == "portal":
-        terrain = trimesh.Trimesh(mesh.vertices - origin, mesh.faces[ground])
-        end = bore.alignment.frames(np.array([15.0]))
-        towards = terrain.face_normals @ end.tangent[0]
-        assert (towards[mesh.station[ground] == 15.0] > 0.9).all()  # the headwall looks out
-        assert (terrain.face_normals[mesh.station[ground] > 15.0, 2] > 0.0).all()
-
-
 def test_works_leave_a_gap_and_strays_and_the_slab_shows_its_floor(tmp_path: Path) -> None:
-    words = ["--truth", "works", "--length", "18", "--seed", "4", "--sensors", "vlp16", "--cloud", "--scan-every", "8"]
-    assert main([*words, "--out", str(tmp_path)]) == 0
+    survey(
+        tmp_path, "--truth", "works", "--length", 18, "--seed", 4, "--sensors", "vlp16", "--cloud", "--scan-every", 8
+    )
     truth = json.loads((tmp_path / "truth.json").read_text())
     cloud = PlyData.read(tmp_path / "cloud.ply")["vertex"]
     points = np.column_stack([cloud[k] for k in "xyz"])

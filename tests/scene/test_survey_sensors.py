@@ -12,9 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from scene.poses.calibration import PRESETS, load_calibration
 from scene.reading.recording import Recording
-from scene.survey.__main__ import main
 from scene.survey.config import SensorErrors
-from tests.scene.surveyed import Cast, Trajectory, load_cast, load_trajectory, read_tum
+from tests.scene.surveyed import Cast, Trajectory, load_cast, load_trajectory, read_tum, survey
 
 EPOCH = 1_700_000_000
 SUFFIXES = ["", "_vlp16", "_os1"]
@@ -22,9 +21,7 @@ ROS1 = get_typestore(Stores.ROS1_NOETIC)
 
 
 def make(out: Path, *more: object) -> Path:
-    args = ["--length", 12, "--seed", 5, "--point-rate", 24000, "--speed", 1.5, "--scan-every", 8]
-    assert main([str(a) for a in [*args, "--out", out, *more]]) == 0
-    return out
+    return survey(out, "--length", 12, "--seed", 5, "--point-rate", 24000, "--speed", 1.5, "--scan-every", 8, *more)
 
 
 @pytest.fixture(scope="module")

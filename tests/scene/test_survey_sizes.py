@@ -7,8 +7,8 @@ import pytest
 
 from scene.survey.bore import draw_bore
 from scene.survey.config import SurveyConfig
+from scene.survey.furniture import DESIGN, TOLERANCE, draw_sizes
 from scene.survey.mesh import Part
-from scene.survey.sizes import DESIGN, TOLERANCE, draw_sizes
 from scene.survey.write import describe_truth
 
 

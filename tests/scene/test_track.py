@@ -9,10 +9,7 @@ from scene.bore import NAIL, Bore
 from scene.errors import FitError
 from scene.fitting.rails import SeenRails
 from scene.fitting.trackseen import SeenLine, SeenSleepers, SeenTrack
-from scene.judging.trackdoubt import doubt_track
-from scene.writing import mjcf
-from scene.writing.mesh import as_trimesh, build_solid, open_lining
-from scene.writing.planar import cut_walls
+from scene.judging.sanity import doubt_track
 from scene.writing.track import TrackConfig, lay_track
 from scene.writing.trackgeoms import fastening_mesh, nail_mesh
 from tests.scene.conftest import arc_bore
@@ -22,21 +19,10 @@ def test_sleepers_stand_every_60_cm_from_end_to_end():
     assert len(lay_track(arc_bore(length=60.0), TrackConfig()).sleeper_station) == 101
 
 
-@pytest.fixture(scope="module")
-def written(bore, tmp_path_factory):
-    """The scene of the bore: its track, its counts and its file."""
-    folder = tmp_path_factory.mktemp("track")
-    laid = lay_track(bore, TrackConfig())
-    solid = build_solid(bore, pockets=False)
-    walls = cut_walls(solid, bore, laid.elevation, 0.7)
-    lining = open_lining(as_trimesh(solid), bore)
-    return laid, mjcf.write_scene(folder, "x", bore, lining, walls, laid, mjcf.SceneConfig()), folder / "scene.xml"
-
-
-def test_the_gauge_is_between_the_inner_faces_of_the_heads(bore, written):
+def test_the_gauge_is_between_the_inner_faces_of_the_heads(bore, arc_scene):
     """Seen by rays in the compiled scene, 16 mm below the rail top; rail centres 1.435 m apart would give 1.362 m."""
-    laid, _, path = written
-    model = mujoco.MjModel.from_xml_path(str(path))
+    folder, laid, _ = arc_scene
+    model = mujoco.MjModel.from_xml_path(str(folder / "scene.xml"))
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     at = bore.axis.at(np.array([10.2]))
@@ -118,9 +104,9 @@ def test_a_track_beside_the_axis_is_as_near_to_a_wall_as_its_nearer_end(bore, as
     np.testing.assert_allclose(laid.clearance, 2.8 - 1.3 - 1.25, atol=0.02)
 
 
-def test_the_scene_file_names_every_sleeper_and_both_rails(written):
-    _, count, path = written
-    text = path.read_text()
+def test_the_scene_file_names_every_sleeper_and_both_rails(arc_scene):
+    folder, _, count = arc_scene
+    text = (folder / "scene.xml").read_text()
     assert text.count('name="sleeper_') == count["sleepers"] == 41
     assert text.count('name="rail_left_') == text.count('name="rail_right_') > 0
 
@@ -138,10 +124,10 @@ def test_each_sleeper_has_two_pads_and_four_clips_on_the_rails_feet():
         assert clip.vertices[inner < config.rail.foot_width / 2, 2].min() == pytest.approx(foot, abs=0.005)
 
 
-def test_rails_stand_on_pads_of_a_centimetre(bore, written):
-    laid, _, path = written
+def test_rails_stand_on_pads_of_a_centimetre(bore, arc_scene):
+    folder, laid, _ = arc_scene
     assert TrackConfig().pad_thickness == 0.010
-    world = ET.parse(path).getroot().find("worldbody")
+    world = ET.parse(folder / "scene.xml").getroot().find("worldbody")
     at = {geom.get("name"): geom for geom in world.iter("geom")}
     foot = at["rail_left_000_foot"]  # to 3 m
     middle, half = (np.array(foot.get(key).split(), float)[2] for key in ("pos", "size"))

@@ -13,8 +13,7 @@ from scene.fitting.lining import add_lining, pair_pockets
 from scene.fitting.section import Sections, fit_sections
 from scene.fitting.turned import find_ring
 from scene.fitting.unroll import Grid
-from tests.scene.fits import axis_of
-from tests.scene.test_reconstruction import thin
+from tests.scene.fits import axis_of, thin
 
 RADIUS, LENGTH, RING, FIRST = 2.75, 24.0, 1.5, 0.4
 HALF, DEPTH, ASIDE = (0.10, 0.09), 0.12, 0.25

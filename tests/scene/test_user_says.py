@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import trimesh
 
 from scene.build import reconstruct
 from scene.cleaning.crop import ExtentConfig, crop_cloud, parse_box
@@ -20,25 +19,18 @@ from tests.scene.files import write_e57, write_las, write_parquet, write_ply, wr
 KNOWN = curved_d_bore(length=24, per_metre=4000, offset=(12.0, -3.0, 2.0))
 
 
-@pytest.fixture(scope="module")
-def cloud_file(tmp_path_factory):
-    path = tmp_path_factory.mktemp("cloud") / "bore.ply"
-    trimesh.PointCloud(KNOWN.points).export(path)
-    return path
-
-
 def rebuilt(path, **extent) -> Reconstruction:
     with Stages() as progress:
         return reconstruct(path, None, ReconstructConfig(extent=ExtentConfig(**extent)), progress)
 
 
 @pytest.fixture(scope="module")
-def whole(cloud_file):
-    return rebuilt(cloud_file)
+def whole(bore_file):
+    return rebuilt(bore_file)
 
 
-def test_from_and_to_keep_the_stations_that_the_whole_build_counts(cloud_file, whole):
-    part = rebuilt(cloud_file, first=6.0, last=18.0, start_chainage=1200.0)
+def test_from_and_to_keep_the_stations_that_the_whole_build_counts(bore_file, whole):
+    part = rebuilt(bore_file, first=6.0, last=18.0, start_chainage=1200.0)
     assert part.bore.length == pytest.approx(12.0, abs=0.1)
     for row, station in ((0, 6.0), (-1, 18.0)):
         expected = whole.bore.axis.at(np.array([station])).position[0] + whole.origin
@@ -49,36 +41,36 @@ def test_from_and_to_keep_the_stations_that_the_whole_build_counts(cloud_file, w
     assert len(part.cause) == len(part.everything.points)
 
 
-def test_reverse_counts_from_the_other_end(cloud_file, whole):
-    turned = rebuilt(cloud_file, reverse=True)
+def test_reverse_counts_from_the_other_end(bore_file, whole):
+    turned = rebuilt(bore_file, reverse=True)
     np.testing.assert_allclose(
         turned.bore.position[0] + turned.origin, whole.bore.position[-1] + whole.origin, atol=0.06
     )
     assert turned.facts["chainage_grows"].startswith("against this, by --reverse")
 
 
-def test_stations_that_leave_nothing_are_refused(cloud_file):
+def test_stations_that_leave_nothing_are_refused(bore_file):
     with pytest.raises(FitError, match=r"--from 22 and --to 24 leave 2\.0 m of a tunnel of 24\.0 m"):
-        rebuilt(cloud_file, first=22.0)
+        rebuilt(bore_file, first=22.0)
 
 
 @pytest.mark.parametrize("columns", [3, pytest.param(2, marks=pytest.mark.slow)], ids=["in space", "in plan"])
-def test_portals_keep_what_lies_between_them(cloud_file, whole, columns):
+def test_portals_keep_what_lies_between_them(bore_file, whole, columns):
     ends = whole.bore.axis.at(np.array([7.0, 17.0])).position + whole.origin
     ends = ends + whole.bore.lateral[0] * 1.0  # somebody's pick of a portal is seldom on the axis
     told = ",".join(f"{value:.3f}" for value in ends[::-1, :columns].ravel())
-    part = rebuilt(cloud_file, portals=told)
+    part = rebuilt(bore_file, portals=told)
     assert part.bore.length == pytest.approx(10.0, abs=0.4)
     assert part.facts["chainage_start"] == pytest.approx(7.0, abs=0.3)
 
 
-def test_portals_that_cannot_be_used_are_refused(cloud_file):
+def test_portals_that_cannot_be_used_are_refused(bore_file):
     with pytest.raises(FitError, match=r"--portals: \(900\.0, 0\.0\) is \d+ m from the axis of the tunnel"):
-        rebuilt(cloud_file, portals="900,0,12,-3")
+        rebuilt(bore_file, portals="900,0,12,-3")
     with pytest.raises(FitError, match="give one of them"):
-        rebuilt(cloud_file, portals="0,0,12,-3", first=2.0)
+        rebuilt(bore_file, portals="0,0,12,-3", first=2.0)
     with pytest.raises(FitError, match=r"--portals is x,y,z,x,y,z of two points .* got '1,2,3'"):
-        rebuilt(cloud_file, portals="1,2,3")
+        rebuilt(bore_file, portals="1,2,3")
 
 
 def test_a_box_keeps_what_is_inside_it_in_the_frame_of_the_input():

@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter
 
 from scene.bore import POCKET, Bore
 from scene.errors import FitError
-from scene.writing.mesh import as_trimesh, build_solid, open_lining
+from scene.writing.mesh import as_trimesh, build_solid, open_lining, split_lining
 from tests.scene.conftest import arc_bore
 
 
@@ -108,3 +108,24 @@ def test_sections_that_fold_into_each_other_are_an_error_with_their_place():
     bore = arc_bore(length=24.0, radius=60.0)
     with pytest.raises(FitError, match=r"fold into each other at \d"):
         build_solid(replace(bore, radius=bore.radius * 25), pockets=False)
+
+
+def test_a_ray_into_a_pocket_goes_13_cm_further(bore):
+    solid = as_trimesh(build_solid(bore, pockets=True))
+    pocket = bore.pocket[0]
+    at = bore.axis.at(np.array([pocket["station"]]))
+    height = np.sin(pocket["angle"]) * np.interp(pocket["angle"], bore.angle, bore.radius[0])
+    origin = at.position[0] + height * at.up[0]
+    inside, beside = (
+        np.linalg.norm(solid.ray.intersects_location([start], [at.lateral[0]])[0][0] - start)
+        for start in (origin, origin - 0.4 * at.tangent[0])
+    )
+    assert inside - beside == pytest.approx(0.13, abs=0.015)
+
+
+def test_chunks_hold_every_face_once(case):
+    bore, _, lining = case
+    parts = split_lining(lining, bore, 5.0)
+    assert len(parts) > 3
+    assert sum(len(part.faces) for part in parts) == len(lining.faces)
+    assert sum(part.area for part in parts) == pytest.approx(lining.area)
