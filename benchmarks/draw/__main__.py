@@ -7,6 +7,8 @@
 import sys
 from importlib import import_module
 
+from subterra_jax.pictures.renderer import choose_gl
+
 COMMANDS = ("kinds", "atlas", "scene", "paper")
 
 
@@ -14,6 +16,7 @@ def main(words: list[str] | None = None) -> int:
     """Runs the command line; returns 2 for a user's mistake."""
     words = sys.argv[1:] if words is None else words
     if words and words[0] in COMMANDS:
+        choose_gl()  # before anything imports MuJoCo
         return int(import_module(f"benchmarks.draw.{words[0]}").main(words[1:]))
     if words and words[0] in ("-h", "--help"):
         print(__doc__)

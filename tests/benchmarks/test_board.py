@@ -89,10 +89,12 @@ def test_tables_and_records_hold_every_agent():
 
 def test_the_picture_names_every_agent_between_floor_and_ceiling_and_marks_its_group():
     names = ("fused", "ring-filter", "locate-map", "locate-transformer")
-    figure = picture.draw([cell(name, 0.5, splits=SPLITS) for name in (*names, "ceiling", "oracle")])
+    some = [cell(name, 0.5, splits=SPLITS) for name in (*names, "oracle")]
+    figure = picture.draw([*some, cell("ceiling", 0.9, splits=SPLITS)])
     (axes,) = figure.axes
+    assert axes.patches[0].get_extents().transformed(axes.transData.inverted()).intervalx == pytest.approx([30.0, 90.0])
     assert [label.get_text() for label in axes.get_yticklabels()] == list(names)
-    assert [text.get_text() for text in axes.texts] == ["floor 30", "ceiling 50"]
+    assert [text.get_text() for text in axes.texts] == ["floor 30", "ceiling 90"]
     handles, groups = axes.get_legend_handles_labels()
     assert len(set(groups)) == len({handle[0].get_marker() for handle in handles}) == 4
 

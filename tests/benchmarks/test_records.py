@@ -9,7 +9,7 @@ import shlex
 import pytest
 
 from benchmarks import records, reproduce
-from benchmarks.command import BenchmarkError
+from benchmarks.command import BenchmarkError, run_module
 from benchmarks.records import Record, rendered
 from tests.test_docs import command_line  # noqa: F401 (a fixture)
 
@@ -106,6 +106,14 @@ def test_a_job_that_fails_names_its_log_and_one_without_its_input_is_left_out(tm
     failing = reproduce.Job(("json.tool nowhere.json",), 1.0)
     with pytest.raises(BenchmarkError, match=r"log.txt: python -m json.tool ended with status"):
         reproduce.run_job(failing, tmp_path / "b", tmp_path)
+
+
+def test_a_command_that_fails_is_told_by_the_last_line_of_its_log(tmp_path):
+    ran = run_module("json.tool", tmp_path / "nowhere.json", log=tmp_path / "log.txt")
+    assert ran.status != 0
+    assert "nowhere.json" in ran.message
+    (tmp_path / "one.json").write_text("1")
+    assert run_module("json.tool", tmp_path / "one.json", log=tmp_path / "log.txt").message == ""
 
 
 def test_the_worst_of_all_dirty_clouds_is_the_record_and_a_refused_one_has_none():

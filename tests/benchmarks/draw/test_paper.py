@@ -84,7 +84,8 @@ def test_the_figures_of_a_short_survey(tmp_path):
     assert run_module("scene.survey", *size, "--out", survey).status == 0
     given = ("--trajectory", survey / "groundtruth.tum", "--provenance", "simulated")
     assert run_module("scene.build", survey / "survey.bag", *given, "--out", scene).status == 0
-    assert main(["--survey", str(survey), "--scene", str(scene), "--out", str(tmp_path)]) == 0
+    given = ("--survey", survey, "--scene", scene, "--out", tmp_path)
+    assert run_module("benchmarks.draw", "paper", *given).status == 0
     captions = json.loads((tmp_path / "figures.json").read_text())
     assert list(captions) == ["fig1", "fig2", "fig3a", "fig3b"]
     assert float(captions["fig1"].partition(" cm from")[0].split()[-1]) < 3.0
