@@ -1,6 +1,7 @@
 """The page about extensions: its files, from outside the package, work wherever a task or a sensor is taken."""
 
 import dataclasses
+import json
 import re
 import sys
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from subterra_jax import tasks
+from subterra_jax import policies, tasks
 from subterra_jax.baselines.registry import make_agent
 from subterra_jax.evaluation import evaluate, listed_episodes
 from subterra_jax.host import task_ids
@@ -146,13 +147,40 @@ def test_board_recorder_and_viewer_take_a_task_from_outside(desk, capsys):
     assert episode.coverage[-1] >= 0.9
 
 
-def test_a_policy_is_trained_on_a_task_from_outside(desk):
+HURRY = """
+import dataclasses
+import jax.numpy as jnp
+import subterra_jax as st
+from gyro import Gyro
+from subterra_jax.rules import StopAt
+
+@dataclasses.dataclass(frozen=True)
+class Hurry(StopAt):
+    key = "hurry"
+
+    def judge(self, step, params):
+        verdict = super().judge(step, params)
+        return dataclasses.replace(verdict, terms={**verdict.terms, "reward_hurry": jnp.asarray(-0.05)})
+
+st.register("Mine/Hurry-v1", Hurry(), horizon=300, parts=(*st.tasks.SLIPPING, Gyro()))
+"""
+
+
+@pytest.mark.parametrize(
+    ("task", "term"), [(TASK, "reward_gap"), ("hurry.py:Mine/Hurry-v1", "reward_hurry")], ids=["task", "reward, sensor"]
+)
+def test_a_policy_is_trained_on_a_task_reward_and_sensor_from_outside(desk, task, term):
     from train import __main__ as navigate
 
-    few = ("--steps=16384", "--evaluation-episodes", "2")
-    status = call(navigate.main, "--task", TASK, *SMALL, *few, "--out", "run")
-    assert status == 0
-    assert (desk / "run" / "evaluation.json").exists()
+    (desk / "hurry.py").write_text(HURRY)
+    few = ("--steps=8192", "--evaluation-episodes", "2", "--tunnel", "control")
+    assert call(navigate.main, "--task", task, *SMALL, *few, "--out", "run") == 0
+    assert json.loads((desk / "run" / "evaluation.json").read_text())["episodes"] == 2
+    lines = [json.loads(line) for line in (desk / "run" / "log.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines] == [4096, 8192]
+    assert lines[-1][term] < 0.0
+    agent, _ = policies.load("run")
+    assert agent.layout.shape.n_inputs == 42  # of a plain task 41: the file's own number is read too
 
 
 STEEL = "steel.py:open:steel"

@@ -137,6 +137,8 @@ def command(arguments: Command) -> int:
 def _world(arguments: Command) -> World:
     """Opens the task for the robot that is to do it."""
     if arguments.embodiment == "scout":
+        if arguments.legs != Legs():
+            raise ConfigError("legs are for embodiment = b2, and embodiment = scout drives on wheels")
         return open_world(
             arguments.task,
             arguments.tunnel,
@@ -146,8 +148,9 @@ def _world(arguments: Command) -> World:
             arguments.preset,
             arguments.hidden_start,
         )
-    if arguments.sensor != "planar16":
-        raise ConfigError(f"sensor = {arguments.sensor}: the B2 carries planar16")
+    for name, usual in (("sensor", "planar16"), ("hidden_start", False), ("val", None)):
+        if (given := getattr(arguments, name)) != usual:
+            raise ConfigError(f"{name} = {given} is for embodiment = scout; with b2 it is {usual}")
     from train.b2 import embodied  # MuJoCo is loaded only where legs are meant
 
     return embodied.open_world(arguments.task, arguments.tunnel, arguments.lining, arguments.legs)

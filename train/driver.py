@@ -7,10 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from subterra_jax.baselines.agent import observed
-from subterra_jax.episode import in_tunnel
 from subterra_jax.policies.layout import Layout
 from subterra_jax.policies.learnt import KIND, LOCALISER, NETWORK
 from subterra_jax.policies.memories import Given
@@ -33,6 +32,23 @@ class Policy:
     network: Any
     localiser: Any = None
     statistics: Any = None
+
+
+@struct.dataclass
+class Seen:
+    """Observations, and where they were made.
+
+    Attributes:
+        flat: The observation.
+        tunnel: Number of the tunnel that a robot is in, of a stack.
+    """
+
+    flat: Float[Array, "*env n_obs"]
+    tunnel: Int[Array, "*env"]
+
+    def here(self, params: Any) -> Any:
+        """Returns the params of one robot's own tunnel."""
+        return params.replace(tunnel=params.tunnel.pick(self.tunnel))
 
 
 class Driver:
@@ -77,48 +93,42 @@ class Driver:
 
     @property
     def n_action(self) -> int:
-        """Numbers of an action."""
-        return self.layout.shape.n_action
+        """Numbers of an action of the environment."""
+        return self.env.action_size
 
-    def begin(self, policy: Policy, observation: Array, params: Any, env_state: Any) -> Any:
+    def see(self, observation: Array, env_state: Any) -> Any:
+        """Returns what `begin`, `take` and `go_on` take in of observations made in states of the environment."""
+        return Seen(observation, env_state.tunnel)
+
+    def begin(self, policy: Policy, seen: Any, params: Any) -> Any:
         """Returns what is kept at the first observation of episodes, which it has taken in."""
-        fresh = self._fresh(policy, observation, params, env_state)
-        still = jnp.zeros((observation.shape[0], len(self._low)))
-        return self.take(policy, fresh, still, observation, params, env_state)
+        fresh = self._fresh(policy, seen, params)
+        return self.take(policy, fresh, jnp.zeros((seen.flat.shape[0], len(self._low))), seen, params)
 
-    def take(self, policy: Policy, kept: Any, action: Array, observation: Array, params: Any, env_state: Any) -> Any:
-        """Returns what is kept after actions and the observations that followed; the states tell the tunnels."""
+    def take(self, policy: Policy, kept: Any, action: Array, seen: Any, params: Any) -> Any:
+        """Returns what is kept after actions and the observations that followed."""
         given, memory = Given(policy.localiser, self._map), self.layout.memory
 
-        def one(kept: Any, action: Array, flat: Array, tunnel: Array) -> Any:
-            here = in_tunnel(self.env, params, tunnel)
-            return memory.take(kept, action[:2], observed(self.env, here, flat), here, given)
+        def one(kept: Any, action: Array, seen: Seen) -> Any:
+            here = seen.here(params)
+            return memory.take(kept, action[:2], observed(self.env, here, seen.flat), here, given)
 
-        return jax.vmap(one)(kept, action, observation, env_state.tunnel)
+        return jax.vmap(one)(kept, action, seen)
 
-    def go_on(
-        self,
-        policy: Policy,
-        kept: Any,
-        action: Array,
-        observation: Array,
-        done: Bool[Array, "env"],
-        params: Any,
-        env_state: Any,
-    ) -> Any:
+    def go_on(self, policy: Policy, kept: Any, action: Array, seen: Any, done: Bool[Array, "env"], params: Any) -> Any:
         """As `take`, begun anew with the observation where an episode is `done`."""
-        fresh = self._fresh(policy, observation, params, env_state)
+        fresh = self._fresh(policy, seen, params)
         mixed = jax.tree.map(lambda new, old: _where(done, new, old), fresh, kept)
-        return self.take(policy, mixed, jnp.where(done[:, None], 0.0, action), observation, params, env_state)
+        return self.take(policy, mixed, jnp.where(done[:, None], 0.0, action), seen, params)
 
-    def _fresh(self, policy: Policy, observation: Array, params: Any, env_state: Any) -> Any:
+    def _fresh(self, policy: Policy, seen: Seen, params: Any) -> Any:
         given, memory = Given(policy.localiser, self._map), self.layout.memory
 
-        def one(flat: Array, tunnel: Array) -> Any:
-            here = in_tunnel(self.env, params, tunnel)
-            return memory.begin(observed(self.env, here, flat), here, given)
+        def one(seen: Seen) -> Any:
+            here = seen.here(params)
+            return memory.begin(observed(self.env, here, seen.flat), here, given)
 
-        return jax.vmap(one)(observation, env_state.tunnel)
+        return jax.vmap(one)(seen)
 
     def inputs(self, policy: Policy, kept: Any) -> Float[Array, "env n"]:
         """Returns the inputs of the network."""
@@ -150,6 +160,14 @@ class Driver:
     def action(self, raw: Float[Array, "env action"]) -> Float[Array, "env action"]:
         """Returns the actions of draws, m/s and rad/s."""
         return to_action(raw, self._low, self._high, self._standing)
+
+    def act(self, raw: Float[Array, "env action"], kept: Any, params: Any) -> Float[Array, "env all"]:
+        """Returns the actions of draws as the environment takes them: with the memory's estimate where one is due."""
+        action = self.action(raw)
+        if action.shape[-1] == self.n_action:
+            return action
+        report = jax.vmap(lambda kept, command: self.layout.memory.report(kept, command, None, params))
+        return jnp.concatenate([action, report(kept, action[:, :2])], axis=1)[:, : self.n_action]
 
     @staticmethod
     def log_prob(out: Outputs, raw: Float[Array, "*batch action"]) -> Float[Array, "*batch"]:

@@ -156,7 +156,7 @@ class Learner(devices.Whole):
         )
         return_statistics = learning.update_statistics(state.return_statistics, returns, self.split)
         batch = self._batch(policy, state.drive, rollout, drive, return_statistics.std)
-        learnt, losses = self._learn(student, batch, key_learn)
+        learnt, losses = self._learn(student, batch, key_learn, state.iteration)
         localiser = state.localiser
         if self._localiser is not None:
             localiser, further = self._localiser.learn(localiser, policy, params, key_localiser, state.iteration)
@@ -204,13 +204,16 @@ class Learner(devices.Whole):
         )
         return Batch(before.memory, rollout, advantage, advantage + rollout.value)
 
-    def _learn(self, student: Student, batch: Batch, key: PRNGKeyArray) -> tuple[Student, dict[str, Array]]:
+    def _learn(
+        self, student: Student, batch: Batch, key: PRNGKeyArray, iteration: Array
+    ) -> tuple[Student, dict[str, Array]]:
         """Learns from every minibatch of one iteration.
 
         A minibatch is a block of environments, which are alike, so that it is read where it lies; each epoch goes
         through the blocks in another order.
         """
         config = self.config
+        left = 1.0 - (1.0 - config.last_rate) * iteration / config.iterations
 
         def minibatch(now: Student, number: Array) -> tuple[Student, dict[str, Array]]:
             block = batch.block(number, config.minibatch_envs)
@@ -218,7 +221,7 @@ class Learner(devices.Whole):
                 jax.grad(self._loss, has_aux=True)(now.weights, block), self.split
             )
             direction, moments = self._adam.update(gradients, now.moments)
-            weights = optax.apply_updates(now.weights, jax.tree.map(lambda d: -now.learning_rate * d, direction))
+            weights = optax.apply_updates(now.weights, jax.tree.map(lambda d: -left * now.learning_rate * d, direction))
             return Student(weights, moments, self._adapt_rate(now.learning_rate, losses["kl"])), losses
 
         keys = jax.random.split(key, config.epochs)

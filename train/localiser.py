@@ -56,7 +56,6 @@ class LocaliserLearner:
         self, driver: Driver, params: Any, config: TrainConfig, split: Parts = (), map: MapStrip | None = None
     ) -> None:
         self.driver, self.config, self.split, self.map = driver, config, split, map
-        self.network = driver.layout.memory.localiser
         self.n_metres = int(config.drive_steps * float(params.vehicle.period) * float(params.vehicle.speed_max))
         self.n_drives = config.drives // config.parts
         self.minibatch = math.gcd(self.n_drives, config.drives_minibatch)
@@ -65,7 +64,7 @@ class LocaliserLearner:
 
     def init(self, key: PRNGKeyArray, given: Any = None) -> LocaliserState:
         """Returns the state before learning, with the weights given where there are some."""
-        weights = memory.init(self.network, self.config.front, key, self.map is not None)
+        weights = memory.init(self.config.front, key, self.map is not None)
         weights = {**weights, **({} if given is None else given)}
         # Of definite types, as they come out of an iteration, or the second one is compiled anew.
         weights = jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype), weights)
@@ -118,7 +117,7 @@ class LocaliserLearner:
         self, weights: Any, drives: Drives, given: MapCase | None, counts: list[Array]
     ) -> tuple[Array, dict[str, Array]]:
         """Returns a chunk's part of the negative log likelihood of the true stations, and of what is logged."""
-        answers, truth, valid = jax.vmap(lambda d: estimate(self.network, weights, d, self.n_metres))(drives)
+        answers, truth, valid = jax.vmap(lambda d: estimate(weights, d, self.n_metres))(drives)
         total, terms = station_loss(answers, truth, valid, counts)
         if given is None or self.map is None:
             return total, terms
@@ -155,12 +154,12 @@ def station_loss(answers: Any, truth: Array, valid: Array, counts: list[Array]) 
     return total, {"error": _sum(jnp.abs(error), valid) / counts[0], "within": near}
 
 
-def estimate(network: str, weights: Any, drive: Drives, n: int) -> tuple[Any, Array, Array]:
+def estimate(weights: Any, drive: Drives, n: int) -> tuple[Any, Array, Array]:
     """Returns answers, truth (m) and whether each metre was completed, of one drive."""
     blocks = streams.metres(drive.record, weights.get("match"), n)
     ends = jnp.arange(1.0, n + 1.0)
     truth = jnp.interp(ends, drive.record.driven, drive.moved) - ends
-    return memory.sequence(network, weights, blocks), truth, streams.reached(drive.record, n)
+    return memory.sequence(weights, blocks), truth, streams.reached(drive.record, n)
 
 
 def _sum(values: Array, valid: Bool[Array, "env metre"]) -> Float[Array, ""]:

@@ -13,49 +13,12 @@ import jax
 import jax.numpy as jnp
 
 from train import clock
-from train.config import TrainConfig
 from train.devices import compiler_options
-from train.report import fetch, fetch_all
+from train.report import fetch
 from train.sinks import Log
 from train.snapshot import Snapshot, Trainable, advance, finished, started, timing
 
 Watcher = Callable[[Snapshot], bool | None]
-
-
-def begin(learner: Trainable, params: Any) -> Snapshot:
-    """Returns an untrained run."""
-    key = learner.share(jax.random.PRNGKey(learner.config.seed))
-    state = jax.jit(learner.init, compiler_options=compiler_options(learner.config))(key, learner.share(params))
-    return started(learner, state)
-
-
-def _compile(init: Any, iterate: Any, key: Any, params: Any, state: Any, config: TrainConfig) -> tuple[Any, Any]:
-    """Compiles the beginning of a run and its iteration at the same time.
-
-    Args:
-        init: From key and params to a state.
-        iterate: From state and params to the next state and a report.
-        key: Of the seed, or of all seeds.
-        params: Parameters of the environment.
-        state: State to go on from; None begins anew.
-        config: Settings.
-
-    Returns:
-        The state, and the compiled iteration.
-    """
-    options = compiler_options(config)
-    clock.lap("start")
-    first = None if state is not None else jax.jit(init).lower(key, params)
-    like = jax.eval_shape(init, key, params) if state is None else state
-    lowered = jax.jit(iterate, donate_argnums=0).lower(like, params)
-    clock.lap("trace")
-    with ThreadPoolExecutor(1) as pool:
-        compiled = pool.submit(lowered.compile, options)
-        if first is not None:
-            state = first.compile(options)(key, params)
-        program = compiled.result()
-    clock.lap("compile")
-    return state, program
 
 
 def train(
@@ -79,38 +42,18 @@ def train(
         The last snapshot. Its `policy` is the best one, which need not be the last.
 
     Raises:
+        RewardError: The reward is not finite.
         TrainingError: The loss is no longer finite.
     """
-    config = learner.config
-    if snapshot is not None and finished(snapshot, config):
-        return snapshot
-    params, began = learner.share(params), time.perf_counter()
-    key = learner.share(jax.random.PRNGKey(config.seed))
-    so_far = None if snapshot is None else snapshot.state
-    state, iterate = _compile(learner.init, learner.iterate, key, params, so_far, config)
-    snapshot = snapshot or started(learner, state)
-    compiled = time.perf_counter()
-    while not finished(snapshot, config):
-        before = time.perf_counter()
-        state, report = iterate(snapshot.state, params)
-        snapshot = advance(snapshot, state, report.policy, *fetch(report), config)
-        snapshot.record["timing"] = timing(began, compiled, before, config.steps_per_iteration)
+    ended = False
+
+    def tell(seed: int, now: Snapshot) -> None:
+        nonlocal ended
         if log is not None:
-            log(snapshot.record)
-        if watch is not None and watch(snapshot):
-            break
-    clock.lap("train")
-    return snapshot
+            log(now.record)
+        ended = watch is not None and bool(watch(now))
 
-
-def over_seeds(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Maps a function of a state (or a key) and params over stacked states.
-
-    An accelerator does all seeds together; a CPU, which one seed fills, does one after the other.
-    """
-    if jax.default_backend() != "cpu":
-        return jax.vmap(function, in_axes=(0, None))
-    return lambda states, params: jax.lax.map(lambda state: function(state, params), states)
+    return train_seeds([learner], params, [snapshot], tell, lambda: ended)[0]
 
 
 def train_seeds(
@@ -136,27 +79,27 @@ def train_seeds(
         The last snapshot of each seed.
 
     Raises:
+        RewardError: The reward of a seed is not finite.
         TrainingError: The loss of a seed is no longer finite.
     """
-    began, first = time.perf_counter(), learners[0]
-    done = [s is not None and finished(s, learner.config) for s, learner in zip(snapshots, learners, strict=True)]
-    if all(done):
-        return [snapshot for snapshot in snapshots if snapshot is not None]
-    known = None if None in snapshots else [snapshot.state for snapshot in snapshots if snapshot is not None]
-    states = None if known is None else jax.tree.map(lambda *leaves: jnp.stack(leaves), *known)
-    keys = jnp.stack([jax.random.PRNGKey(learner.config.seed) for learner in learners])
-    states, iterate = _compile(over_seeds(first.init), over_seeds(first.iterate), keys, params, states, first.config)
-    fresh = _apart(states, len(learners))
-    now = [s or started(learner, state) for s, learner, state in zip(snapshots, learners, fresh, strict=True)]
-    if known is None and any(snapshot is not None for snapshot in snapshots):
-        states = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[snapshot.state for snapshot in now])
+    known = [snapshot for snapshot in snapshots if snapshot is not None]
+    if len(known) == len(learners) and all(map(_done, known, learners)):
+        return known
+    began, first, n = time.perf_counter(), learners[0], len(learners)
+    params = first.share(params)
+    keys = _joined([learner.share(jax.random.PRNGKey(learner.config.seed)) for learner in learners])
+    states = _joined([snapshot.state for snapshot in known]) if len(known) == n else None
+    states, iterate = _compile(over_seeds(first.init, n), over_seeds(first.iterate, n), keys, params, states, first)
+    now = [s or started(learner, x) for s, learner, x in zip(snapshots, learners, _apart(states, n), strict=True)]
+    if 0 < len(known) < n:
+        states = _joined([snapshot.state for snapshot in now])
     compiled = time.perf_counter()
     while not all(map(_done, now, learners)) and not stop():
         before = time.perf_counter()
         states, reports = iterate(states, params)
-        fetched = fetch_all(reports, len(learners))
-        timed = timing(began, compiled, before, first.config.steps_per_iteration * len(learners))
-        parts = _apart((states, reports.policy), len(learners))
+        fetched = fetch(reports, None if n == 1 else n)
+        timed = timing(began, compiled, before, first.config.steps_per_iteration * n)
+        parts = _apart((states, reports.policy), n)
         for k, (learner, (state, policy), (ended, metrics)) in enumerate(zip(learners, parts, fetched, strict=True)):
             if _done(now[k], learner):
                 continue
@@ -168,13 +111,59 @@ def train_seeds(
     return now
 
 
+def over_seeds(function: Callable[..., Any], n: int) -> Callable[..., Any]:
+    """Maps a function of a state (or a key) and params over `n` stacked states; one alone is not stacked.
+
+    An accelerator does all seeds together; a CPU, which one seed fills, does one after the other.
+    """
+    if n == 1:
+        return function
+    if jax.default_backend() != "cpu":
+        return jax.vmap(function, in_axes=(0, None))
+    return lambda states, params: jax.lax.map(lambda state: function(state, params), states)
+
+
+def _compile(init: Any, iterate: Any, key: Any, params: Any, state: Any, learner: Trainable) -> tuple[Any, Any]:
+    """Compiles the beginning of a run and its iteration at the same time.
+
+    Args:
+        init: From key and params to a state.
+        iterate: From state and params to the next state and a report.
+        key: Of the seed, or of all seeds.
+        params: Parameters of the environment.
+        state: State to go on from; None begins anew.
+        learner: Has the settings.
+
+    Returns:
+        The state, and the compiled iteration.
+    """
+    options = compiler_options(learner.config)
+    clock.lap("start")
+    first = None if state is not None else jax.jit(init).lower(key, params)
+    like = jax.eval_shape(init, key, params) if state is None else state
+    lowered = jax.jit(iterate, donate_argnums=0).lower(like, params)
+    clock.lap("trace")
+    with ThreadPoolExecutor(1) as pool:
+        compiled = pool.submit(lowered.compile, options)
+        if first is not None:
+            state = first.compile(options)(key, params)
+        program = compiled.result()
+    clock.lap("compile")
+    return state, program
+
+
 def _done(snapshot: Snapshot, learner: Trainable) -> bool:
     return finished(snapshot, learner.config)
 
 
+def _joined(trees: list[Any]) -> Any:
+    """Stacks trees; one alone stays as it is."""
+    return trees[0] if len(trees) == 1 else jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
+
+
 def _apart(tree: Any, n: int) -> list[Any]:
-    """Splits a stacked tree."""
-    return [_part(tree, k) for k in range(n)]
+    """Splits what `_joined` joined."""
+    return [tree] if n == 1 else [_part(tree, k) for k in range(n)]
 
 
 @jax.jit

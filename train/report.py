@@ -96,22 +96,26 @@ def in_a_row(finished: Finished) -> Ended:
 Told = tuple[Ended, dict[str, np.ndarray]]
 
 
-def fetch(given: Report) -> Told:
-    """Fetches the ended episodes, cut to their count, and the metrics."""
+def fetch(given: Report, n: int | None = None) -> list[Told]:
+    """Fetches the ended episodes, cut to their count, and the metrics, in one transfer.
+
+    Args:
+        given: One report, or several stacked along the first axis.
+        n: Number of reports in the stack; None is one that is not stacked.
+
+    Returns:
+        Episodes and metrics of each report.
+    """
     ended, metrics = jax.device_get((given.ended, given.metrics))
-    return _cut(ended, given.finished.done.shape, lambda: given.finished), metrics
+    shape = given.finished.done.shape
+    if n is None:
+        return [(_cut(ended, shape, lambda: given.finished), metrics)]
 
+    def one(k: int) -> Told:
+        mine, scalars = jax.tree.map(lambda x: x[k], (ended, metrics))
+        return _cut(mine, shape[1:], lambda: jax.tree.map(lambda x: x[k], given.finished)), scalars
 
-def fetch_all(given: Report, n: int) -> list[Told]:
-    """Fetches `n` reports that are stacked along the first axis, in one transfer."""
-    ended, metrics = jax.device_get((given.ended, given.metrics))
-    shape = given.finished.done.shape[1:]
-    return [_one(ended, metrics, shape, given.finished, k) for k in range(n)]
-
-
-def _one(ended: Ended, metrics: dict[str, Any], shape: tuple[int, ...], finished: Finished, k: int) -> Told:
-    mine, scalars = jax.tree.map(lambda x: x[k], (ended, metrics))
-    return _cut(mine, shape, lambda: jax.tree.map(lambda x: x[k], finished)), scalars
+    return [one(k) for k in range(n)]
 
 
 def _cut(ended: Ended, shape: tuple[int, ...], finished: Callable[[], Finished]) -> Ended:

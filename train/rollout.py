@@ -64,9 +64,8 @@ def begin(env: Any, driver: Driver, policy: Policy, params: Any, key: PRNGKeyArr
     """Starts an episode in every environment."""
     start_key, scan_key = jax.random.split(key)
     env_state = _begin(env, params, start_key, n_envs)
-    observation = _observe(env, params, env_state, env.draw_step(scan_key, (n_envs,), params))
     zero = jnp.zeros(n_envs)
-    kept = driver.begin(policy, observation, params, env_state)
+    kept = driver.begin(policy, _see(driver, params, env_state, env.draw_step(scan_key, (n_envs,), params)), params)
     return Drive(env_state, kept, driver.start_memory((n_envs,)), zero.astype(jnp.int32), zero)
 
 
@@ -116,7 +115,7 @@ def collect(
         inputs = driver.inputs(policy, now.kept)
         out, memory = driver.answer(policy, inputs, now.memory)
         raw = driver.sample(out, key_action)
-        action = driver.action(raw)
+        action = driver.act(raw, now.kept, params)
         error = driver.target(now.env_state, now.kept, params)
         noise = env.draw_step(key_env, (n_envs,), params)
         stepped, reward, terminated, truncated, info = jax.vmap(env.advance, (0, 0, 0, None))(
@@ -124,7 +123,7 @@ def collect(
         )
         done = terminated | truncated
         env_state = _choose(done, _begin(env, params, key_start, n_envs), stepped)
-        observation = _observe(env, params, env_state, noise)
+        seen = _see(driver, params, env_state, noise)
         total, length = now.episode_return + reward, now.age + 1
         stored = Rollout(
             inputs=inputs,
@@ -143,7 +142,7 @@ def collect(
         last = _choose(truncated, Last(stepped, now.kept, action, memory), last)
         after = Drive(
             env_state=env_state,
-            kept=driver.go_on(policy, now.kept, action, observation, done, params, env_state),
+            kept=driver.go_on(policy, now.kept, action, seen, done, params),
             memory=jnp.where(done[:, None], 0.0, memory),
             age=jnp.where(done, 0, length),
             episode_return=jnp.where(done, 0.0, total),
@@ -154,8 +153,8 @@ def collect(
     nobody = Last(drive.env_state, drive.kept, jnp.zeros((n_envs, driver.n_action)), drive.memory)
     keys = jax.random.split(key_steps, n_steps)
     (after, last), (stored, finished, terms) = jax.lax.scan(step, (drive, nobody), keys)
-    final = _observe(env, params, last.env_state, env.draw_step(key_last, (n_envs,), params))
-    kept = driver.take(policy, last.kept, last.action, final, params, last.env_state)
+    final = _see(driver, params, last.env_state, env.draw_step(key_last, (n_envs,), params))
+    kept = driver.take(policy, last.kept, last.action, final, params)
     value = driver.answer(policy, driver.inputs(policy, kept), last.memory)[0].value
     stored = dataclasses.replace(stored, final_value=jnp.where(stored.truncated, value, 0.0))
     return after, stored, finished, jax.tree.map(jnp.mean, terms)
@@ -165,8 +164,8 @@ def _begin(env: Any, params: Any, key: PRNGKeyArray, n_envs: int) -> Any:
     return jax.vmap(env.begin, (0, None))(env.draw_reset(key, (n_envs,), params), params)
 
 
-def _observe(env: Any, params: Any, env_state: Any, noise: Any) -> Array:
-    return jax.vmap(env.observe, (0, 0, None))(env_state, noise, params)
+def _see(driver: Driver, params: Any, env_state: Any, noise: Any) -> Any:
+    return driver.see(jax.vmap(driver.env.observe, (0, 0, None))(env_state, noise, params), env_state)
 
 
 def _choose(condition: Bool[Array, "env"], new: Any, old: Any) -> Any:

@@ -28,7 +28,7 @@ from train.log import (
     read_log,
 )
 from train.policies import make_agent
-from train.ppo import train, train_seeds
+from train.ppo import train_seeds
 from train.sinks import NO_LOGS, Logs, Sink
 from train.snapshot import WINDOW, Snapshot, Trainable, finished
 from train.world import World
@@ -78,30 +78,8 @@ class Session:
         Returns:
             The last snapshot; None after Ctrl-C, with the checkpoint saved.
         """
-        snapshot = self.folder.begin(resume=resume, overwrite=overwrite)
-        world, config = self.world, self.learner.config
-        self.open(snapshot)
-        bar = Bar(config.steps, snapshot.iteration * config.steps_per_iteration if snapshot else 0)
-        with deferred_interrupt() as interrupt:
-
-            def watch(now: Snapshot) -> bool:
-                # Processes that train together stop together: at the end.
-                stop = interrupt.wanted and jax.process_count() == 1
-                if devices.leads():
-                    bar.show(now.record, of=label)
-                self.note(now, save=stop)
-                return stop
-
-            try:
-                last = train(self.learner, world.params, snapshot=snapshot, watch=watch)
-            finally:
-                bar.close()
-                self.close()
-            self.finish(last)
-            if interrupt.wanted:
-                print(f"interrupted after {last.iteration} iterations; go on with --resume", file=sys.stderr)
-                return None
-        return last
+        last = train_sessions([self], [self.folder.begin(resume=resume, overwrite=overwrite)], [label])
+        return None if last is None else last[0]
 
     def note(self, now: Snapshot, *, save: bool = False) -> None:
         """Logs an iteration; writes a checkpoint where one is due, or asked for."""
@@ -147,6 +125,40 @@ def check_seeds(seeds: tuple[int, ...]) -> None:
             raise ConfigError(f"seed {seed} is named {seeds.count(seed)} times")
 
 
+def train_sessions(
+    sessions: list[Session], snapshots: list[Snapshot | None], labels: list[str]
+) -> list[Snapshot] | None:
+    """Trains runs that differ by their seed to their end, each from its snapshot; None after Ctrl-C, all saved."""
+    config = sessions[0].learner.config
+    for session, snapshot in zip(sessions, snapshots, strict=True):
+        session.open(snapshot)
+    bar = Bar(config.steps, max((s.iteration for s in snapshots if s), default=0) * config.steps_per_iteration)
+    with deferred_interrupt() as interrupt:
+
+        def stop() -> bool:
+            # Processes that train together stop together: at the end.
+            return interrupt.wanted and jax.process_count() == 1
+
+        def watch(k: int, now: Snapshot) -> None:
+            if devices.leads():
+                bar.show(now.record, of=labels[k])
+            sessions[k].note(now, save=stop())
+
+        try:
+            last = train_seeds([s.learner for s in sessions], sessions[0].world.params, snapshots, watch, stop)
+        finally:
+            bar.close()
+            for session in sessions:
+                session.close()
+        for session, snapshot in zip(sessions, last, strict=True):
+            session.finish(snapshot)
+        if interrupt.wanted:
+            done = max(snapshot.iteration for snapshot in last)
+            print(f"interrupted after {done} iterations; go on with --resume", file=sys.stderr)
+            return None
+    return last
+
+
 def run_seeds(out: Path, sessions: list[Session], *, resume: bool, overwrite: bool, episodes: int) -> int:
     """Trains, draws and evaluates every seed; prints what each took to reach the goal.
 
@@ -156,34 +168,10 @@ def run_seeds(out: Path, sessions: list[Session], *, resume: bool, overwrite: bo
     snapshots = (
         resume_seeds(sessions) if resume else [s.folder.begin(resume=False, overwrite=overwrite) for s in sessions]
     )
-    config = sessions[0].learner.config
-    for session, snapshot in zip(sessions, snapshots, strict=True):
-        session.open(snapshot)
-    bar = Bar(config.steps, max((s.iteration for s in snapshots if s), default=0) * config.steps_per_iteration)
-    with deferred_interrupt() as interrupt:
-
-        def watch(k: int, now: Snapshot) -> None:
-            bar.show(now.record, of=f"seed {sessions[k].learner.config.seed}")
-            sessions[k].note(now, save=interrupt.wanted)
-
-        try:
-            last = train_seeds(
-                [session.learner for session in sessions],
-                sessions[0].world.params,
-                snapshots,
-                watch,
-                lambda: interrupt.wanted,
-            )
-        finally:
-            bar.close()
-            for session in sessions:
-                session.close()
-        for session, snapshot in zip(sessions, last, strict=True):
-            session.finish(snapshot)
-        write_curve([session.folder.path for session in sessions], out / "curve.png")
-        if interrupt.wanted:
-            print("interrupted; go on with --resume", file=sys.stderr)
-            return EXIT_INTERRUPTED
+    last = train_sessions(sessions, snapshots, [f"seed {session.learner.config.seed}" for session in sessions])
+    write_curve([session.folder.path for session in sessions], out / "curve.png")
+    if last is None:
+        return EXIT_INTERRUPTED
     if not episodes:
         return 0
     found = [session.score(snapshot, episodes) for session, snapshot in zip(sessions, last, strict=True)]

@@ -7,6 +7,7 @@ import jax
 import numpy as np
 
 from subterra_jax.baselines.agent import n_ranges, observed
+from subterra_jax.baselines.histogram import HistogramLocaliser
 from subterra_jax.episode import in_tunnel
 from subterra_jax.policies.inputs import WAY_AT
 from subterra_jax.policies.layout import Layout
@@ -24,39 +25,44 @@ from train.policies import begin_with
 from train.snapshot import Trainable
 from train.world import World
 
+# Tasks in which a localiser is of use.
+_ERRANDS = {"along": ("stop", "return"), "map": ("stop", "return", "report")}
 
-def make_layout(env: Any, params: Any, config: TrainConfig, localiser: Any = None) -> Layout:
+
+def make_layout(env: Any, params: Any, config: TrainConfig, given: Given | None = None) -> Layout:
     """Returns the layout of a network for an environment; compiles nothing.
 
     Args:
         env: A navigation environment.
         params: Its params.
         config: Settings.
-        localiser: Weights of the localiser, for `memory = along`.
+        given: Weights of the localiser for `memory = along`, the filter for `map`.
 
     Raises:
         ConfigError: A setting does not go with the task.
     """
-    kept = Memory(config.memory, config.frames if config.memory == "stack" else 1)
+    kept = Memory(config.memory, config.frames if config.memory == "stack" else 1, config.map_cell)
     flat, here = jax.ShapeDtypeStruct((env.observation_size(params),), np.float32), in_tunnel(env, params, 0)
 
     def look(flat: Any) -> Any:
-        return kept.inputs(kept.begin(observed(env, here, flat), here, Given(localiser)))
+        return kept.inputs(kept.begin(observed(env, here, flat), here, given or Given()))
 
     bounds = env.action_space(params)
+    # What the filter believes is the report, and the network is left with the command.
+    n_action = 2 if config.memory == "map" else len(bounds.low)
     asks = config.auxiliary and config.memory == "gru"
     if config.auxiliary and env.rule.errand not in ("stop", "return"):
         raise ConfigError(f"auxiliary = True asks for the way to a goal, and {env.id} has none")
     shape = Shape(
         n_inputs=jax.eval_shape(look, flat).shape[0],
-        n_action=len(bounds.low),
+        n_action=n_action,
         hidden=tuple(config.hidden),
         cell=config.cell if config.memory == "gru" else 0,
         way_at=WAY_AT if asks else None,
         init_std=config.init_std,
         half=config.half,
     )
-    low, high = (tuple(float(bound) for bound in side) for side in (bounds.low, bounds.high))
+    low, high = (tuple(float(bound) for bound in side[:n_action]) for side in (bounds.low, bounds.high))
     return Layout(kept, shape, low, high, config.standing)
 
 
@@ -67,40 +73,55 @@ def make_learner(world: World, config: TrainConfig) -> Trainable:
         ConfigError: A setting makes no sense, or does not go with the task, its sensor or the memory.
     """
     check(config)
-    spreads = config.parts > 1
-    split: Parts = SPLIT if spreads else ()
     given = Policy(None) if config.begin_from is None else begin_with(config.begin_from)
     env, params = world.env, world.params
+    _check_world(env, params, config, given)
+    split: Parts = SPLIT if config.parts > 1 else ()
+    map, localiser, shapes = None, None, None
+    if config.memory == "along":
+        shapes, map = _shapes(given.localiser, config), map_strip(params.tunnel) if config.map else None
+    else:
+        given = dataclasses.replace(given, localiser=None)
+    if config.memory == "map":
+        map = HistogramLocaliser.of(params, cell=config.map_cell)
+    driver = Driver(env, make_layout(env, params, config, Given(shapes, map)), map)
+    if config.memory == "along" and config.auxiliary:
+        localiser = LocaliserLearner(driver, params, config, split, map)
+    learner = Learner(env, driver, config, split, given=_fitting(driver, given, config), localiser=localiser)
+    return Spread(learner) if split else learner
+
+
+def _check_world(env: Any, params: Any, config: TrainConfig, given: Policy) -> None:
+    """Raises `ConfigError` where a setting does not go with the task, its sensor or the weights to begin with."""
     if config.unroll >= int(np.min(np.asarray(params.horizon))):
         raise ConfigError(
             f"unroll = {config.unroll} must be shorter than an episode of {env.id}, {params.horizon} steps"
         )
+    errands = _ERRANDS.get(config.memory)
+    if errands is not None and env.rule.errand not in errands:
+        raise ConfigError(
+            f"memory = {config.memory} is for tasks that ask to {' or '.join(errands)}, and {env.id} asks to "
+            f"{env.rule.errand}"
+        )
     if config.memory != "along":
         if config.begin_from is not None and given.network is None:
             raise ConfigError(f"begin_from = {config.begin_from}: a localiser, and memory = {config.memory} takes none")
-        driver = Driver(env, make_layout(env, params, config))
-        learner = Learner(
-            env, driver, config, split, given=_fitting(driver, dataclasses.replace(given, localiser=None))
-        )
-        return Spread(learner) if spreads else learner
-    if env.rule.errand not in ("stop", "return"):
-        raise ConfigError(f"memory = along looks along the way to a goal, and {env.id} asks to {env.rule.errand}")
+        return
     if n_ranges(params) % 16:
         raise ConfigError(f"memory = along needs 16 level beams or a multiple, and {env.id} has {n_ranges(params)}")
     if given.localiser is None and not config.auxiliary:
         raise ConfigError("memory = along needs auxiliary = True, or a localiser to begin from")
-    strip = map_strip(params.tunnel) if config.map else None
-    shapes = given.localiser
-    if shapes is None or config.map:
-        fresh = jax.eval_shape(lambda key: memory.init("transformer", config.front, key, config.map), jax.random.key(0))
-        shapes = {**jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), fresh), **(shapes or {})}
-    driver = Driver(env, make_layout(env, params, config, shapes), strip)
-    localiser = LocaliserLearner(driver, params, config, split, strip) if config.auxiliary else None
-    learner = Learner(env, driver, config, split, given=_fitting(driver, given), localiser=localiser)
-    return Spread(learner) if spreads else learner
 
 
-def _fitting(driver: Driver, given: Policy) -> Policy:
+def _shapes(given: Any, config: TrainConfig) -> Any:
+    """Returns weights of the localiser by whose shapes a policy is laid out: those given, and zeros for the others."""
+    if given is not None and not config.map:
+        return given
+    fresh = jax.eval_shape(lambda key: memory.init(config.front, key, config.map), jax.random.key(0))
+    return {**jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), fresh), **(given or {})}
+
+
+def _fitting(driver: Driver, given: Policy, config: TrainConfig) -> Policy:
     """Returns the weights to begin with; refuses a network of other sizes.
 
     Raises:
@@ -108,7 +129,7 @@ def _fitting(driver: Driver, given: Policy) -> Policy:
     """
     if given.network is None:
         return given
-    wanted = flat(jax.eval_shape(driver.init, jax.random.key(0)))
+    wanted, source = flat(jax.eval_shape(driver.init, jax.random.key(0))), config.begin_from
     found = flat(given.network)
     for name, leaf in wanted.items():
         tensor = found.get(name)
@@ -117,5 +138,7 @@ def _fitting(driver: Driver, given: Policy) -> Policy:
             found[name] = np.concatenate([tensor, np.zeros((1, *tensor.shape[1:]), np.float32)])
         elif tensor is None or tensor.shape != leaf.shape:
             has = "no such weights" if tensor is None else f"{tuple(tensor.shape)}"
-            raise ConfigError(f"begin_from has another network: {name} is {tuple(leaf.shape)} here and has {has} there")
+            raise ConfigError(
+                f"begin_from = {source} has another network: {name} is {tuple(leaf.shape)} here and has {has} there"
+            )
     return dataclasses.replace(given, network=nested({name: found[name] for name in wanted}))

@@ -33,6 +33,10 @@ class TrainingError(SubterraError):
     exit_status = EXIT_FAILED
 
 
+class RewardError(SubterraError):
+    """The reward of a task is infinite or no number."""
+
+
 class EpisodeWindow:
     """The last hundred finished episodes.
 
@@ -92,11 +96,11 @@ class EpisodeWindow:
 
 @dataclasses.dataclass(frozen=True)
 class Best:
-    """The policy whose rolling hundred did best: by success first, then by return.
+    """The last policy that did as well as any before it, as far as a hundred episodes tell.
 
     Attributes:
-        score: Mean success and mean return of the hundred episodes.
-        iteration: The iteration that ended with them.
+        score: Mean success of the best hundred episodes, and their mean return.
+        iteration: The iteration of the policy.
         policy: The policy that drove that iteration.
     """
 
@@ -106,13 +110,19 @@ class Best:
 
     @staticmethod
     def of(best: "Best | None", window: EpisodeWindow, iteration: int, policy: Any, *, keep: bool = True) -> "Best":
-        """Returns the better of `best` and the policy that has just driven; before a hundred episodes, the latter.
+        """Returns the policy that has just driven, or `best` where that did better by three standard errors.
 
-        Without `keep` always the latter: where a task becomes harder while it is learnt, scores do not compare.
+        The luckiest of many hundreds is no better than those after it. Without `keep` it is always the former: where a
+        task becomes harder while it is learnt, scores do not compare.
         """
         # An unfinished hundred scores below every finished one, so that a lucky first episode wins nothing.
         score = (window.mean("success") or 0.0, window.mean("episode_return") or 0.0) if window.full else (-1.0, 0.0)
-        return best if keep and best is not None and best.score > score else Best(score, iteration, policy)
+        if best is None or not keep or best.score[0] < 0.0:
+            return Best(score, iteration, policy)
+        middle = 0.5 * (score[0] + best.score[0])
+        if best.score[0] - score[0] > 3.0 * math.sqrt(2.0 * middle * (1.0 - middle) / WINDOW):
+            return best
+        return Best(max(score, best.score), iteration, policy)
 
 
 class Trainable(Protocol):
@@ -219,16 +229,12 @@ def advance(
         config: Settings.
 
     Raises:
-        TrainingError: A scalar is no longer finite.
+        RewardError: The reward is not finite.
+        TrainingError: Another scalar is no longer finite.
     """
     iteration, window = before.iteration + 1, before.window
     if broken := [name for name, value in metrics.items() if not math.isfinite(value)]:
-        if "reward_mean" in broken:
-            raise TrainingError(f"iteration {iteration}: the task's reward is not finite; a reward must be a number")
-        raise TrainingError(
-            f"iteration {iteration}: {', '.join(broken)} {'is' if len(broken) == 1 else 'are'} no longer finite; "
-            "the last checkpoint is good, and a smaller learning_rate may help"
-        )
+        _refuse(iteration, broken)
     rows = window.add(ended, before.iteration * config.steps_per_iteration, config.n_envs)
     coverage, success = window.mean("coverage"), window.mean("success")
     holds = window.full and (coverage or 0.0) >= config.stop_coverage and success == 1.0
@@ -253,4 +259,18 @@ def advance(
         solved_for=before.solved_for + 1 if holds else 0,
         record=record,
         rows=rows,
+    )
+
+
+def _refuse(iteration: int, broken: list[str]) -> None:
+    """Raises the error of an iteration some of whose scalars are not finite."""
+    if "reward_mean" not in broken:
+        raise TrainingError(
+            f"iteration {iteration}: {', '.join(broken)} {'is' if len(broken) == 1 else 'are'} no longer finite; "
+            "the last checkpoint is good, and a smaller learning_rate may help"
+        )
+    terms = [name for name in broken if name.startswith("reward_") and name not in ("reward_mean", "reward_scale")]
+    raise RewardError(
+        f"iteration {iteration}: the task's reward is not finite ({', '.join(terms) or 'no single term'}); "
+        "a policy learns from finite rewards alone"
     )

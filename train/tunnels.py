@@ -12,7 +12,6 @@ from typing import Any
 
 import jax
 
-import subterra_jax as st
 from subterra_jax import constants
 from subterra_jax.host.files import replace_file
 from subterra_jax.host.versions import VERSION
@@ -48,11 +47,6 @@ def names_of(names: str) -> list[str]:
         TunnelError: There is no such tunnel.
     """
     return [name for part in names.split(",") for name in expand(part)]
-
-
-def enter(task: str, tunnels: list[Tunnel], sensor: str = PLANAR) -> tuple[Any, Any]:
-    """Returns a task in one or several tunnels, which must have been loaded for the sensor."""
-    return st.make(task, tunnel=tunnels if len(tunnels) > 1 else tunnels[0], sensor=sensor)
 
 
 def load(

@@ -26,7 +26,6 @@ CHECKPOINTS, CHECKPOINT_POLICY = "checkpoint", "policy"  # of a run folder: numb
 _TYPES = {"F32": "<f4", "F16": "<f2"}  # of tensors on disk; in memory all are float32
 GAIT = "walk"  # the kind that moves legs and drives no task
 TRAINED_UNDER = "trained_under"  # field of the facts
-_PERIODS = {None: 0.1, "b2": 0.2}  # s, by embodiment, of files without `TRAINED_UNDER`
 _FACTS = ("name", "kind", "task", "layout", "tensors_sha256")
 
 
@@ -54,11 +53,8 @@ class Conditions:
 
     @classmethod
     def from_facts(cls, facts: dict[str, Any]) -> "Conditions":
-        """Reads them from the facts of a policy; files without them are of the planar robots' or the B2's period."""
-        known = dict(facts.get(TRAINED_UNDER, {}))
-        if not known:
-            embodiment = facts.get("world", {}).get("embodiment")
-            return cls(facts["task"], _PERIODS.get(embodiment, _PERIODS[None]))
+        """Reads them from the facts of a policy."""
+        known = dict(facts[TRAINED_UNDER])
         fields = known.pop("fields", None)
         return cls(facts["task"], **known, fields=None if fields is None else tuple(fields))
 

@@ -42,7 +42,9 @@ class Layout:
             TypeError: Something is not known.
             ValueError: There is no such memory.
         """
-        memory, shape = Memory(**values["memory"]), dict(values["shape"])
+        own = {field.name for field in dataclasses.fields(Memory)}
+        memory = Memory(**{name: value for name, value in values["memory"].items() if name in own})
+        shape = dict(values["shape"])
         if memory.kind not in MEMORIES:
             raise ValueError(f"memory must be one of {', '.join(MEMORIES)}, got {memory.kind!r}")
         shape["hidden"] = tuple(shape["hidden"])

@@ -10,7 +10,7 @@ import numpy as np
 
 from subterra_jax.baselines import registry
 from subterra_jax.compiled import in_32_bits
-from subterra_jax.policies.files import GAIT, Conditions, PolicyError, PolicyFile, read, released
+from subterra_jax.policies.files import GAIT, TRAINED_UNDER, Conditions, PolicyError, PolicyFile, read, released
 from subterra_jax.policies.learnt import Learnt
 from subterra_jax.policies.locate.agent import Locating
 from subterra_jax.policies.trained import Trained
@@ -160,7 +160,8 @@ def _checked(file: PolicyFile) -> Trained:
     """The agent of a file, driven once on paper so that a missing or misshapen tensor is found here."""
     facts = file.facts
     try:
-        agent = from_tensors(facts["kind"], facts["layout"], file.tensors, facts["name"], Conditions.from_facts(facts))
+        conditions = Conditions.from_facts(facts) if TRAINED_UNDER in facts else None
+        agent = from_tensors(facts["kind"], facts["layout"], file.tensors, facts["name"], conditions)
         agent.try_out()
     except (KeyError, TypeError, ValueError) as error:
         raise PolicyError(f"{file.path}: tensors and layout do not belong together ({error})") from error

@@ -1,7 +1,7 @@
 """What a policy keeps between observations beside the network's own memory: reckoning, a stack, a localiser.
 
-The station that the inputs show as a way to go is dead-reckoned, or with `along` the learnt localiser's. All functions
-take one robot; training and driving call the same ones.
+The station that the inputs show as a way to go is dead-reckoned; with `along` it is the learnt localiser's, with `map`
+that of a histogram filter on the map. All functions take one robot; training and driving call the same ones.
 """
 
 import dataclasses
@@ -13,7 +13,8 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from subterra_jax.baselines.agent import Observed
-from subterra_jax.baselines.stations import Driven, Station, told_start
+from subterra_jax.baselines.histogram import HistogramLocaliser
+from subterra_jax.baselines.stations import Driven, Station, believed_start, told_start
 from subterra_jax.baselines.steering import CentreLine, Corridor
 from subterra_jax.policies import inputs
 from subterra_jax.policies.inputs import Reckoned
@@ -22,7 +23,7 @@ from subterra_jax.policies.locate.map_strip import MapStrip
 from subterra_jax.policies.locate.ways import TwoWays
 from subterra_jax.state import EnvParams
 
-MEMORIES = ("none", "stack", "gru", "along")
+MEMORIES = ("none", "stack", "gru", "along", "map")
 
 
 @struct.dataclass
@@ -66,12 +67,17 @@ class Memory:
     Attributes:
         kind: One of `MEMORIES`.
         frames: Observations in the stack, the newest included; 1 but with `stack`.
-        localiser: Network of the localiser, of `locate.memory.NETWORKS`; for `along`.
+        cell: Length of a cell of the belief, m; for `map`.
     """
 
     kind: str = "none"
     frames: int = 1
-    localiser: str = "transformer"
+    cell: float = 0.25
+
+    @property
+    def locates(self) -> bool:
+        """True where a localiser estimates the station; the inputs then end with how sure it is."""
+        return self.kind in ("along", "map")
 
     @property
     def relief(self) -> bool:
@@ -82,10 +88,11 @@ class Memory:
         """Returns what is kept before the first `take`, which gets the same observation and a command of 0."""
         reckoned = inputs.begin(obs)
         located = None
-        if self.kind == "along":
-            localiser = given.localiser(self, params)
-            station = Station(told_start(obs, params), jnp.log(jnp.float32(0.05)), jnp.ones(()))
-            memory = localiser.begin(obs, params)
+        if self.locates:
+            localiser, anywhere = given.localiser(params), params.errand == "report"
+            start, sigma = believed_start(obs, params) if anywhere else (told_start(obs, params), 0.05)
+            station = Station(jnp.asarray(start, jnp.float32), jnp.log(jnp.float32(sigma)), jnp.ones(()))
+            memory = localiser.begin_anywhere(obs, params) if anywhere else localiser.begin(obs, params)
             located = Located(CentreLine().begin(obs, params), jnp.ones(()), memory, station)
         seen = self._look(reckoned, located, obs, params)
         return Kept(reckoned, jnp.repeat(seen[None], self.frames - 1, axis=0), located, seen)
@@ -109,9 +116,24 @@ class Memory:
         """Returns the inputs of a robot whose goal is far away, for `along`."""
         return jnp.append(inputs.look(reckoned, obs, jnp.float32(inputs.FAR), params, self.relief), 0.0)
 
-    def estimate(self, kept: Kept, obs: Observed, params: EnvParams) -> tuple[Array, Array, Array]:
-        """Returns the station believed (m), the log of its standard deviation (m), and the direction faced."""
-        if kept.located is not None:
+    def report(
+        self, kept: Kept, command: Float[Array, "2"], obs: Observed | None, params: EnvParams
+    ) -> Float[Array, "3"]:
+        """Returns station (m), log of its standard deviation (m) and direction at the end of a command.
+
+        Args:
+            kept: What is kept.
+            command: The command, m/s and rad/s.
+            obs: The observation that it answers; not needed where a localiser estimates the station.
+            params: The task.
+        """
+        station, log_sigma, direction = self._estimate(kept, obs, params)
+        return jnp.stack([station + direction * command[0] * params.vehicle.period, log_sigma, direction])
+
+    def _estimate(self, kept: Kept, obs: Observed | None, params: EnvParams) -> tuple[Array, Array, Array]:
+        """Returns station and log of its standard deviation before the command, and the direction."""
+        if kept.located is not None or obs is None:
+            assert kept.located is not None, "dead reckoning needs the observation"
             station = kept.located.station
             return station.station, station.log_sigma, station.direction
         turned = inputs.is_turned(kept.reckoned, obs)
@@ -125,13 +147,15 @@ class Memory:
     def _look(self, reckoned: Reckoned, located: Located | None, obs: Observed, params: EnvParams) -> Array:
         way = inputs.way_to_go(reckoned, obs, params)
         log_sigma = jnp.zeros(())
-        if located is not None and params.errand in ("stop", "return"):
+        if located is not None and params.errand == "report":
+            way, log_sigma = params.goal.travel_max - (obs.distance - reckoned.distance), located.station.log_sigma
+        elif located is not None:
             station, log_sigma = located.station.station, located.station.log_sigma
             way = obs.goal - station
             if params.errand == "return":
                 way = jnp.where(reckoned.flag > 0.5, station - told_start(obs, params), way)
         seen = inputs.look(reckoned, obs, way, params, self.relief)
-        return jnp.append(seen, log_sigma) if self.kind == "along" else seen
+        return jnp.append(seen, log_sigma) if self.locates else seen
 
     def _locate(
         self,
@@ -150,7 +174,7 @@ class Memory:
         turned = direction != before.direction
         walls = jax.tree.map(lambda new, old: jnp.where(turned, new, old), fresh, walls)
         driven = Driven(command[0], CentreLine().cosine(walls), direction, raised, walls)
-        station, memory = given.localiser(self, params).update(before.localiser, obs, driven, params, None)
+        station, memory = given.localiser(params).update(before.localiser, obs, driven, params, None)
         return Located(walls, direction, memory, station)
 
 
@@ -159,16 +183,18 @@ class Given:
     """What a memory is made with.
 
     Attributes:
-        weights: Of the localiser, as `locate.memory.init` makes them; None without one.
-        map: The map; None has none.
+        weights: Of the learnt localiser, as `locate.memory.init` makes them; None without one.
+        map: The map as the learnt localiser takes it, or a filter on it in its place; None has none.
         blind: Cut what the walls tell: an ablation.
     """
 
     weights: Any = None
-    map: MapStrip | None = None
+    map: MapStrip | HistogramLocaliser | None = None
     blind: bool = struct.field(pytree_node=False, default=False)
 
-    def localiser(self, memory: Memory, params: EnvParams) -> Any:
+    def localiser(self, params: EnvParams) -> Any:
         """Returns the localiser of a task."""
-        locator = Locator(self.weights, memory.localiser, self.map, self.blind)
+        if isinstance(self.map, HistogramLocaliser):
+            return self.map
+        locator = Locator(self.weights, self.map, self.blind)
         return TwoWays(locator) if params.errand == "return" else locator

@@ -15,7 +15,6 @@ from subterra_jax.baselines.stations import Driven
 from subterra_jax.baselines.steering import Corridor
 from subterra_jax.policies import PolicyError, check_fits, from_tensors, training_conditions
 from subterra_jax.policies.locate import bends, map_filter, matching, memory, streams
-from subterra_jax.policies.locate.agent import check_tensors
 from subterra_jax.policies.locate.blocks import DELAY, Block
 from subterra_jax.policies.locate.locator import Locator
 from subterra_jax.policies.locate.ways import TwoWays
@@ -34,25 +33,14 @@ def _random_blocks(n, key=1):
     )
 
 
-@pytest.mark.parametrize(
-    "network",
-    memory.NETWORKS,
-)
-def test_a_memory_gives_the_same_metre_by_metre_as_all_at_once(network):
-    weights = memory.init(network, "match", jax.random.key(2))
+def test_a_memory_gives_the_same_metre_by_metre_as_all_at_once():
+    weights = memory.init("match", jax.random.key(2))
     blocks = _random_blocks(35)
-    whole = memory.sequence(network, weights, blocks)
-    one = lambda state, block: memory.step(network, weights, state, block)  # noqa: E731
-    stepped = jax.lax.scan(one, memory.start(network, weights), blocks)[1]
+    whole = memory.sequence(weights, blocks)
+    one = lambda state, block: memory.step(weights, state, block)  # noqa: E731
+    stepped = jax.lax.scan(one, memory.start(), blocks)[1]
     for name in ("correction", "share", "log_scale"):
         np.testing.assert_allclose(getattr(whole, name), getattr(stepped, name), atol=2e-4)
-
-
-def test_a_network_or_front_that_does_not_exist_is_named():
-    with pytest.raises(ValueError, match="no network 'lstm'"):
-        memory.init("lstm", "match", jax.random.key(0))
-    with pytest.raises(ValueError, match="a map is taken with front match, not with wide"):
-        memory.init("transformer", "wide", jax.random.key(0), with_map=True)
 
 
 def _ranges(driven, share=0.01):
@@ -78,14 +66,8 @@ def _looked_at(ranges, driven, walls):
     return jax.lax.scan(step, jnp.zeros(()), (ranges, moved))[1]
 
 
-@pytest.mark.parametrize(
-    ("network", "front", "with_map"),
-    [
-        ("transformer", "match", True),
-        pytest.param("transformer", "wide", False, marks=pytest.mark.slow),
-    ],
-)
-def test_a_robot_makes_the_metres_of_its_training(network, front, with_map):
+@pytest.mark.parametrize(("front", "with_map"), [("match", True), pytest.param("wide", False, marks=pytest.mark.slow)])
+def test_a_robot_makes_the_metres_of_its_training(front, with_map):
     rng = np.random.default_rng(7)
     speed = np.where(np.arange(240) % 9 < 7, 2.0, 0.7)  # not all metres have five steps
     speed[0] = 0.0
@@ -94,10 +76,10 @@ def test_a_robot_makes_the_metres_of_its_training(network, front, with_map):
     read = jnp.asarray(np.cumsum(0.1 * speed * 1.02 + 0.01 * rng.standard_normal(240)) + 5.0, jnp.float32)
     walls = Corridor(jnp.float32(HALF), jnp.float32(HALF), jnp.float32(0.0))
     points = _looked_at(ranges, driven, walls)
-    weights = memory.init(network, front, jax.random.key(4), with_map)
+    weights = memory.init(front, jax.random.key(4), with_map)
     n = int(driven[-1])
     record = streams.Record(jnp.asarray(driven, jnp.float32), read, points)
-    whole = memory.sequence(network, weights, streams.metres(record, weights["match"], n))
+    whole = memory.sequence(weights, streams.metres(record, weights["match"], n))
     strip = map_of_walls(first=-3.0 - 0.7) if with_map else None  # told 0.7 m too far back
     if strip is not None:
         age = jnp.arange(1.0, n + 1.0)
@@ -112,7 +94,7 @@ def test_a_robot_makes_the_metres_of_its_training(network, front, with_map):
         vehicle=SimpleNamespace(period=0.1),
         lidar=SimpleNamespace(range_max=30.0),
     )
-    locator, one, no = Locator(weights, network, strip), jnp.ones(()), jnp.zeros((), bool)
+    locator, one, no = Locator(weights, strip), jnp.ones(()), jnp.zeros((), bool)
 
     def step(now, row):
         r, distance, v = row
@@ -131,26 +113,26 @@ def test_a_robot_makes_the_metres_of_its_training(network, front, with_map):
     assert np.ptp(np.asarray(whole.correction)) > 0.02  # there is something to compare
 
 
-@pytest.mark.parametrize("network", memory.NETWORKS)
-def test_tensors_of_a_localiser_come_back_as_an_agent_or_are_refused(network):
-    tensors = flat(memory.init(network, "match", jax.random.key(0)))
-    layout = {"network": network, "action_low": [0.0, -1.5], "action_high": [2.0, 1.5]}
-    agent = from_tensors("locate", layout, tensors, "one")
-    check_tensors(agent)
+LAYOUT = {"action_low": [0.0, -1.5], "action_high": [2.0, 1.5]}
+
+
+def test_tensors_of_a_localiser_come_back_as_an_agent_or_are_refused():
+    tensors = flat(memory.init("match", jax.random.key(0)))
+    from_tensors("locate", LAYOUT, tensors, "one").try_out()
     name = next(iter(tensors))
-    with pytest.raises(KeyError, match=name):
-        check_tensors(from_tensors("locate", layout, {k: v for k, v in tensors.items() if k != name}, "one"))
-    with pytest.raises(ValueError, match=r"is \(2, 3\)"):
-        check_tensors(from_tensors("locate", layout, {**tensors, name: jnp.zeros((2, 3))}, "one"))
-    with pytest.raises(ValueError, match="extra is of no"):
-        check_tensors(from_tensors("locate", layout, {**tensors, "extra": jnp.zeros(3)}, "one"))
+    for wrong, error, message in (
+        ({k: v for k, v in tensors.items() if k != name}, KeyError, name),
+        ({**tensors, name: jnp.zeros((2, 3))}, ValueError, r"is \(2, 3\)"),
+        ({**tensors, "extra": jnp.zeros(3)}, ValueError, "extra is of no"),
+    ):
+        with pytest.raises(error, match=message):
+            from_tensors("locate", LAYOUT, wrong, "one").try_out()
 
 
 def _trained(env, params):
-    layout = {"network": "transformer", "action_low": [0.0, -1.5], "action_high": [2.0, 1.5]}
-    tensors = flat(memory.init("transformer", "match", jax.random.key(0)))
+    tensors = flat(memory.init("match", jax.random.key(0)))
     here = dataclasses.replace(training_conditions(env, params), fields=None)
-    return from_tensors("locate", layout, tensors, "one", here)
+    return from_tensors("locate", LAYOUT, tensors, "one", here)
 
 
 @pytest.mark.parametrize(
@@ -203,7 +185,7 @@ def test_a_way_back_begins_at_the_place_that_the_flag_tells():
         lidar=SimpleNamespace(range_max=30.0),
         goal=SimpleNamespace(flag_reach=2.0),
     )
-    ways = TwoWays(Locator(memory.init("transformer", "match", jax.random.key(0)), "transformer"))
+    ways = TwoWays(Locator(memory.init("match", jax.random.key(0))))
     advance = jax.jit(lambda driven, direction, flagged, now: _way(ways, driven, direction, flagged, now, params))
     obs = Observed(jnp.zeros(16), jnp.zeros(16), distance=jnp.zeros(()), heading=jnp.zeros(()))
     now, stations = ways.begin(obs, params), []

@@ -38,7 +38,7 @@ def test_every_task_has_presets_that_make_sense(task, preset):
 
 
 def test_an_unknown_memory_or_preset_is_refused_with_those_there_are():
-    with pytest.raises(ConfigError, match="none, stack, gru, along"):
+    with pytest.raises(ConfigError, match="none, stack, gru, along, map"):
         make_config("Subterra/Traverse-v1", memory="tape")
     with pytest.raises(ConfigError, match="cpu, gpu"):
         make_config("Subterra/Traverse-v1", "abacus")

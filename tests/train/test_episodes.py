@@ -14,7 +14,7 @@ def finished(done, coverage, success, episode_return, length):
 
 
 def add(window, unroll, step):
-    ended, _ = fetch(report(unroll, {}, None))
+    ((ended, _),) = fetch(report(unroll, {}, None))
     return window.add(ended, step, unroll.done.shape[1])
 
 
@@ -52,7 +52,7 @@ def test_more_episodes_than_there_is_room_for_are_fetched_all_the_same():
     unroll = random_unroll(np.random.default_rng(3), n_steps=64, n_envs=40, p_done=0.5)
     small = in_a_row(unroll)
     assert int(small.count) > len(small.index)
-    ended, _ = fetch(Report(unroll, small, {}, None))
+    ((ended, _),) = fetch(Report(unroll, small, {}, None))
     time, env = np.nonzero(unroll.done)
     np.testing.assert_array_equal(ended.index, time * 40 + env)
     np.testing.assert_array_equal(ended.coverage, unroll.coverage[time, env])
@@ -61,7 +61,7 @@ def test_more_episodes_than_there_is_room_for_are_fetched_all_the_same():
 
 def test_few_episodes_are_the_same_rows_without_the_unroll():
     unroll = random_unroll(np.random.default_rng(4), n_steps=64, n_envs=40, p_done=0.02)
-    ended, _ = fetch(Report(unroll, in_a_row(unroll), {}, None))
+    ((ended, _),) = fetch(Report(unroll, in_a_row(unroll), {}, None))
     time, env = np.nonzero(unroll.done)
     np.testing.assert_array_equal(ended.index, time * 40 + env)
     np.testing.assert_array_equal(ended.length, unroll.length[time, env])
@@ -96,14 +96,14 @@ def named(name):
     return Policy(name)
 
 
-def test_the_best_policy_is_chosen_by_success_then_by_return_then_by_being_later():
+def test_the_policy_that_is_kept_is_the_last_that_did_no_worse_than_the_best_hundred():
     best = Best.of(None, full_window(0.9, 10.0), 1, named("first"))
-    best = Best.of(best, full_window(0.8, 99.0), 2, named("more return, less success"))
+    best = Best.of(best, full_window(0.6, 99.0), 2, named("worse by more than chance"))
     assert best.policy.network == "first"
-    best = Best.of(best, full_window(0.9, 11.0), 3, named("more return"))
-    assert best.policy.network == "more return"
-    best = Best.of(best, full_window(0.9, 11.0), 4, named("later"))
-    assert (best.policy.network, best.iteration) == ("later", 4)
+    best = Best.of(best, full_window(0.85, 11.0), 3, named("as good"))
+    best = Best.of(best, full_window(0.7, 11.0), 4, named("worse than the first, not than the third"))
+    assert (best.policy.network, best.iteration, best.score[0]) == ("as good", 3, 0.9)
+    assert Best.of(best, full_window(0.9, 11.0), 5, named("later")).iteration == 5
 
 
 def test_no_policy_is_the_best_before_a_hundred_episodes_have_finished():

@@ -1,6 +1,4 @@
 import json
-import subprocess
-import sys
 
 import jax
 import jax.numpy as jnp
@@ -60,14 +58,12 @@ def test_a_trained_policy_succeeds_without_its_exploration_noise(trained):
     assert scores["contacts"] == 0
 
 
-def test_the_command_prints_one_line_of_json_and_nothing_else(trained, tunnel):
-    line = [sys.executable, "-m", "train.evaluate", "--policy", str(trained), "--task", TASK]
-    ran = subprocess.run(
-        [*line, "--tunnel", str(tunnel), "--episodes", "100", "--json"], capture_output=True, text=True, check=True
-    )
-    assert ran.stdout.count("\n") == 1
+def test_the_command_prints_one_line_of_json_and_nothing_else(trained, tunnel, capfd):
+    words = ("--policy", str(trained), "--task", TASK, "--tunnel", str(tunnel), "--episodes", "100", "--json")
+    assert call(evaluate.main, *words) == 0
+    (line,) = capfd.readouterr().out.splitlines()
     saved = json.loads((trained / "evaluation.json").read_text())
-    assert json.loads(ran.stdout) == {name: value for name, value in saved.items() if name != "schema"}
+    assert json.loads(line) == {name: value for name, value in saved.items() if name != "schema"}
 
 
 @pytest.mark.parametrize(

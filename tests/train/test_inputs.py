@@ -8,13 +8,16 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
+from subterra_jax import policies
 from subterra_jax.baselines.agent import observed
 from subterra_jax.policies import inputs
+from subterra_jax.policies.memories import Given
 from train.config import TrainConfig
 from train.driver import Driver, Policy
 from train.policies import begin_with, make_agent
 from train.rollout import begin, collect
-from train.setup import make_layout
+from train.setup import make_layout, make_learner
+from train.world import open_world
 
 N_ENVS, N_STEPS = 2, 6
 GOAL_TASKS = ("StopAtShort-v1", "Return-v1", "Obstructed-v1", "Faulted-v1")
@@ -28,7 +31,7 @@ def plan():
 def train_and_drive(plan, task, config, localiser=None, **made):
     """An unroll as training drives it, and what an agent with the same weights answers to the same observations."""
     env, params = st.make(f"Subterra/{task}", tunnel=plan, **made)
-    driver = Driver(env, make_layout(env, params, config, localiser))
+    driver = Driver(env, make_layout(env, params, config, Given(localiser)))
     policy = Policy(jax.tree.map(lambda x: x + 0.01, driver.init(jax.random.PRNGKey(0))), localiser)
     agent = make_agent(driver, policy)
     agent.try_out()
@@ -66,7 +69,7 @@ def test_training_and_driving_read_equal_numbers(plan, task):
         state = jax.tree.map(lambda leaf, step=step: leaf[step, 0], states)
         flat = env.observe(state, env.draw_step(jax.random.PRNGKey(5), (), params), params)
         obs = observed(env, params, flat)
-        own = memory.take(kept.kept, kept.command, obs, params, agent._given)
+        own = memory.take(kept.kept, kept.command, obs, params, agent.given)
         there = np.asarray(seen[step, 0, n:])
         np.testing.assert_allclose(np.asarray(own.seen)[~ranges], there[~ranges], atol=1e-5)
         assert np.mean(np.abs(np.asarray(own.seen) - there)[4:36]) < 0.1
@@ -112,25 +115,25 @@ def test_after_the_flag_the_way_leads_back_to_the_start(plan):
     assert not inputs.is_turned(now, there)
 
 
-def test_no_input_holds_what_the_auxiliary_head_is_asked_for(plan):
-    """The reckoning reads the odometer, so that the target differs between robots whose inputs are the same."""
-    env, params = st.make("Subterra/StopAtShort-v1", tunnel=plan)
-    config = TrainConfig(hidden=(8,), memory="gru", cell=8, auxiliary=True)
-    driver = Driver(env, make_layout(env, params, config))
-    flat, state = env.reset(jax.random.key(0), params)
+def test_a_filter_on_the_map_reports_what_it_believes_in_training_as_in_driving():
+    world = open_world("Relocalise-v1", "open:straight:train:2")
+    config = TrainConfig(memory="map", map_cell=0.5, n_envs=4, unroll=6, minibatches=2, hidden=(8,))
+    learner = make_learner(world, config)
+    env, params, driver = world.env, world.params, learner.driver
+    assert (driver.layout.shape.n_action, env.action_size) == (2, 5)
     policy = Policy(driver.init(jax.random.PRNGKey(0)))
-    moved = dataclasses.replace(state, station=state.station + 5.0)
-    here, there = (jax.tree.map(lambda leaf: leaf[None], one) for one in (state, moved))
-    kept = driver.begin(policy, flat[None], params, here)
-    targets = [driver.target(one, kept, params) for one in (here, there)]
-    assert targets[0][0, 0] - targets[1][0, 0] == pytest.approx(5.0, abs=1e-3)
-    again = driver.begin(policy, flat[None], params, there)
-    np.testing.assert_array_equal(driver.inputs(policy, kept), driver.inputs(policy, again))
-    # An unroll stores inputs and target apart, and the network is given the former alone.
-    error = jnp.full((1, 1, 1), 1e6)
-    assert driver.unroll(
-        policy.network, driver.inputs(policy, kept)[None], driver.start_memory((1,)), error[..., 0] > 0
-    )
+    agent = policies.with_map(make_agent(driver, policy), params)
+    policies.check_fits(agent, env, params, "mine")
+    first = jax.jit(lambda: begin(env, driver, policy, params, jax.random.PRNGKey(1), 2))()
+    kept, state = first.kept, jax.tree.map(lambda leaf: leaf[0], first.env_state)
+    action = driver.act(jnp.zeros((2, 2)), kept, params)
+    assert action.shape == (2, 5)
+    flat = env.observe(state, env.draw_step(jax.random.PRNGKey(5), (), params), params)
+    obs = observed(env, params, flat)
+    told, _ = agent.act(None, agent.begin(None, obs, params), obs, params, None)
+    assert jnp.exp(told[3]) > 5.0  # one scan does not tell the place
+    assert 0.0 < told[2] < params.tunnel.length
+    np.testing.assert_allclose(jnp.exp(action[0, 3]), jnp.exp(told[3]), rtol=0.5)
 
 
 def test_a_localiser_drives_in_training_as_in_an_agent(plan):
@@ -139,4 +142,4 @@ def test_a_localiser_drives_in_training_as_in_an_agent(plan):
     _, _, driver, policy, agent, (seen, *_) = train_and_drive(plan, "StopAtShort-v1", config, localiser)
     assert seen.shape[-1] == driver.layout.shape.n_inputs
     assert np.isfinite(seen).all()
-    assert agent._given.weights["match"]["taps"].shape == policy.localiser["match"]["taps"].shape
+    assert agent.given.weights["match"]["taps"].shape == policy.localiser["match"]["taps"].shape

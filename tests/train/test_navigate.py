@@ -42,11 +42,28 @@ def test_a_run_folder_holds_everything(trained):
         (("--preset", "abacus"), "unknown preset 'abacus'"),
         (("--minibatches", "7"), "n_envs = 128 cannot be divided into minibatches = 7"),
         (("--memory", "tape"), "unknown memory 'tape'"),
-        (("--auxiliary",), "auxiliary is learnt by a memory, gru or along, and memory = none has none to ask"),
-        (("--map",), "map = True is for memory along with front match, not none with match"),
+        (("--auxiliary",), "auxiliary = True is for memory = gru or along, and memory = none does not read it"),
+        (("--map",), "map = True is for memory = along, and memory = none does not read it"),
+        (("--frames", "8"), "frames = 8 is for memory = stack, and memory = none does not read it"),
+        (("--memory", "stack", "--cell", "8"), "cell = 8 is for memory = gru, and memory = stack does not read it"),
+        (("--memory", "along", "--map", "--front", "wide"), "map = True is for front = match, and front = wide"),
+        (("--legs.robots", "3"), "legs are for embodiment = b2, and embodiment = scout drives on wheels"),
+        (
+            ("--embodiment", "b2", "--sensor", "vlp16"),
+            "sensor = vlp16 is for embodiment = scout; with b2 it is planar16",
+        ),
+        (("--embodiment", "b2", "--val", "control"), "val = control is for embodiment = scout; with b2 it is None"),
+        (
+            ("--begin-from", "locate-transformer"),
+            "begin_from = locate-transformer: a localiser, and memory = none takes",
+        ),
+        (
+            ("--begin-from", "TraverseShort-v1", "--hidden", "7"),
+            "begin_from = TraverseShort-v1 has another network: actor.hidden_0.",
+        ),
         (("--begin-from", "nobody"), "begin_from = nobody: nobody: no such policy"),
         (("--memory", "gru", "--auxiliary"), "auxiliary = True asks for the way to a goal, and Subterra/"),
-        (("--memory", "along"), "memory = along looks along the way to a goal, and Subterra/"),
+        (("--memory", "along"), "memory = along is for tasks that ask to stop or return, and Subterra/"),
         (("--unroll", "600"), "unroll = 600 must be shorter than an episode of Subterra/TraverseShort-v1, 600 steps"),
         (("--steps", "0"), "steps must be at least 1, got 0"),
         (("--tunnel", "nowhere.npz"), "nowhere.npz: no such tunnel file"),
@@ -62,6 +79,35 @@ def test_a_mistake_is_one_sentence_and_status_2_before_anything_is_written(tmp_p
     assert message in error
     assert error.count("\n") == 1
     assert not list((tmp_path / "run").iterdir())
+
+
+NOT_A_NUMBER = """
+import dataclasses
+import jax.numpy as jnp
+import subterra_jax as st
+from subterra_jax.rules import Traverse
+
+@dataclasses.dataclass(frozen=True)
+class Hasty(Traverse):
+    key = "hasty"
+
+    def judge(self, step, params):
+        verdict = super().judge(step, params)
+        time = jnp.log(step.place.station - 3.0)
+        return dataclasses.replace(verdict, terms={**verdict.terms, "reward_time": time})
+
+st.register("Mine/Hasty-v1", Hasty(), horizon=100)
+"""
+
+
+def test_a_reward_of_a_users_own_that_is_no_number_ends_the_training_in_one_sentence(tmp_path, tunnel, capsys):
+    (tmp_path / "hasty.py").write_text(NOT_A_NUMBER)
+    words = ("--task", f"{tmp_path / 'hasty.py'}:Mine/Hasty-v1", "--tunnel", str(tunnel), *SMALL)
+    assert call(navigate.main, *words, "--out", str(tmp_path / "run")) == 2
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
+    assert line == (
+        "error: iteration 1: the task's reward is not finite (reward_time); a policy learns from finite rewards alone"
+    )
 
 
 def test_an_output_that_is_a_file_is_refused(tmp_path, capsys):

@@ -10,14 +10,12 @@ import pytest
 
 import subterra_jax as st
 from subterra_jax.policies import load_policy
-from tests.train.conftest import SMALL, TASK, call, log_without_timing
+from tests.train.conftest import TASK, call, log_without_timing
 from train import __main__ as navigate
 from train import sinks
 from train.__main__ import read_command
-from train.config import ConfigError, TrainConfig
+from train.config import ConfigError
 from train.options import read_settings, reward_of, settings_of
-from train.ppo import train
-from train.setup import make_learner
 from train.sinks import Logs
 from train.world import open_world, with_reward
 
@@ -164,13 +162,6 @@ def test_a_function_of_ones_own_gets_every_line_of_the_log(tmp_path, monkeypatch
         sink.write({})
 
 
-def test_training_from_python_calls_a_function_with_every_line_of_the_log(tunnel):
-    world, told = open_world(TASK, tunnel), []
-    config = TrainConfig(n_envs=64, unroll=64, minibatches=4, hidden=(32, 32), steps=4096)
-    train(make_learner(world, config), world.params, log=told.append)
-    assert [line["step"] for line in told] == [4096]
-
-
 @pytest.mark.parametrize(
     ("logs", "message"),
     [
@@ -204,9 +195,3 @@ def test_weights_and_biases_gets_every_number_at_its_step(tmp_path, monkeypatch)
     assert values == {"learning/iteration": 1, "loss/policy_loss": 0.5, "learning/steps_per_second": 7}
     assert end == "end"
     assert sinks.NO_LOGS.open(tmp_path, 0, {}) == []
-
-
-def test_every_kind_of_network_names_its_size_on_the_command_line():
-    assert read_command(["--out", "o", "--hidden", "8", "4", "--frames", "3"]).config.hidden == (8, 4)
-    assert read_command(["--out", "o", "--task", "Subterra/StopAt-v1", "--memory=gru", "--cell=8"]).config.cell == 8
-    assert SMALL[-2:] == ("32", "32")

@@ -14,7 +14,7 @@ from subterra_jax.parts.unicycle import VehicleParams
 from tests.train.conftest import TASK, call
 from train import evaluate, release
 from train.config import TrainConfig
-from train.driver import Driver, Policy
+from train.driver import Driver, Policy, Seen
 from train.policies import facts_file, make_agent, open_agent, write_tensors
 from train.setup import make_layout
 
@@ -43,8 +43,7 @@ def test_a_gru_drives_without_the_trainer_as_it_does_with_it(gru):
     agent = make_agent(driver, policy)
     flat, state = env.reset(jax.random.key(0), params)
     memory = agent.begin(None, observed(env, params, flat), params)
-    batched = lambda tree: jax.tree.map(lambda leaf: leaf[None], tree)  # noqa: E731
-    kept, cell = driver.begin(policy, flat[None], params, batched(state)), driver.start_memory((1,))
+    kept, cell = driver.begin(policy, Seen(flat[None], np.zeros(1, int)), params), driver.start_memory((1,))
     act = jax.jit(lambda memory, flat: agent.act(None, memory, observed(env, params, flat), params, None))
 
     @jax.jit
@@ -59,7 +58,7 @@ def test_a_gru_drives_without_the_trainer_as_it_does_with_it(gru):
         np.testing.assert_allclose(action[:2], wanted[0], atol=1e-5)
         assert 0.0 < action[2] < params.tunnel.length
         flat, state, *_ = step(jax.random.key(i), state, wanted[0], params)
-        kept = driver.take(policy, kept, wanted, flat[None], params, batched(state))
+        kept = driver.take(policy, kept, wanted, Seen(flat[None], np.zeros(1, int)), params)
 
 
 def test_released_tensors_are_what_the_safetensors_library_reads(gru, released):
@@ -96,10 +95,11 @@ def test_a_tensor_that_is_missing_or_of_another_shape_is_refused(gru, released):
             policies.load(released)
 
 
-def test_a_policy_of_other_fields_is_refused_with_both_sides_named(gru, released):
-    agent, _ = policies.load(released)
+def test_a_policy_of_other_fields_is_refused_with_both_sides_named(gru):
+    plain = policies.training_conditions(*gru[:2])
+    agent = make_agent(*gru[2:], conditions=plain)
     env, params = st.make(GOAL_TASK, tunnel="open:cast:train:0", imu=ImuParams())
-    with pytest.raises(policies.PolicyError, match=r"reads \d+ numbers; .*StopAtShort-v1 with its fields .*imu.* has"):
+    with pytest.raises(policies.PolicyError, match=r"reads \d+ numbers of the fields ranges.*; .*imu.* has"):
         policies.check_fits(agent, env, params, "mine")
 
 
@@ -113,33 +113,17 @@ def test_what_is_released_is_scored_like_the_run_it_comes_from(trained, tunnel, 
     saved.pop("schema")
     assert json.loads(capsys.readouterr().out) == saved
     assert json.loads(facts_file(out).read_text())["scores"] == saved
+    constants = st.constants_digest(*st.make(TASK))
+    for source in (trained, out):
+        agent, _ = open_agent(source, None)
+        assert agent.conditions == policies.Conditions(TASK, 0.1, 16, ("ranges", "odometry"), constants)
     assert call(release.main, str(trained), "--out", str(tmp_path / "corridor.bin")) == 2
     assert "must end in .safetensors" in capsys.readouterr().err
 
 
-def with_period(task: str, period: float):
-    return st.make(task, vehicle=VehicleParams(period=period))
-
-
-def test_a_policy_is_refused_where_the_control_period_is_another_than_it_was_trained_with(trained, tmp_path):
-    agent, _ = open_agent(trained, None)
-    constants = st.constants_digest(*st.make(TASK))
-    assert agent.conditions == policies.Conditions(TASK, 0.1, 16, ("ranges", "odometry"), constants)
-    policies.check_fits(agent, *st.make(TASK), "mine")
-    with pytest.raises(policies.PolicyError, match=r"mine: trained with a control period of 0\.1 s, .* has 0\.05 s"):
-        policies.check_fits(agent, *with_period(TASK, 0.05), "mine")
-    out = tmp_path / "mine.safetensors"
-    assert call(release.main, str(trained), "--out", str(out), "--episodes=1") == 0
-    assert json.loads(facts_file(out).read_text())["trained_under"]["period"] == 0.1
-    again, _ = policies.load(out)
-    assert again.conditions == agent.conditions
-    with pytest.raises(policies.PolicyError, match=r"0\.1 s, .* has 0\.05 s"):
-        policies.check_fits(again, *with_period(TASK, 0.05), out)
-
-
 def test_a_released_policy_among_the_agents_is_refused_as_well():
     policies.register_released()
-    _, params = with_period("Subterra/Traverse-v1", 0.05)
+    _, params = st.make("Subterra/Traverse-v1", vehicle=VehicleParams(period=0.05))
     with pytest.raises(policies.PolicyError, match=r"Traverse-v1: trained with .* 0\.1 s, this task has 0\.05 s"):
         registry.make_agent("policy:Traverse-v1", params)
 
@@ -147,6 +131,7 @@ def test_a_released_policy_among_the_agents_is_refused_as_well():
 @pytest.mark.parametrize(
     ("conditions", "message"),
     [
+        ({"period": 0.05}, r"mine: trained with a control period of 0\.05 s, Subterra/TraverseShort-v1 has 0\.1 s"),
         ({"period": 0.1, "n_beams": 24}, "mine: trained with 24 beams, Subterra/TraverseShort-v1 has 16"),
         (
             {"period": 0.1, "constants": "0123456789abcdef"},
@@ -158,7 +143,7 @@ def test_a_released_policy_among_the_agents_is_refused_as_well():
         ),
     ],
 )
-def test_other_beams_and_fields_are_refused_with_both_sides_named(conditions, message):
+def test_another_period_beams_and_fields_are_refused_with_both_sides_named(conditions, message):
     trained_under = policies.Conditions.from_facts({"task": TASK, "trained_under": conditions})
     env, params = st.make(TASK)
     driver = Driver(env, make_layout(env, params, TrainConfig(hidden=(4,))))

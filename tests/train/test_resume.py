@@ -1,5 +1,6 @@
 """A run that was killed goes on with `--resume`, whenever the kill came, and ends as if nothing had happened."""
 
+import dataclasses
 import json
 import os
 import random
@@ -9,13 +10,17 @@ import sys
 import time
 import types
 
+import jax
 import numpy as np
 import pytest
 
 from subterra_jax.policies import load
-from tests.train.conftest import SMALL, TASK, call, log_without_timing
-from train import __main__ as navigate
+from tests.train.conftest import SMALL, TASK, log_without_timing
 from train import checkpoint, folder, session
+from train.config import TrainConfig
+from train.ppo import train
+from train.setup import make_learner
+from train.world import open_world
 
 pytestmark = pytest.mark.door
 
@@ -63,6 +68,31 @@ def test_before_the_first_checkpoint_a_run_begins_again(whole, train_small, tmp_
     assert (out / "episodes.csv").read_bytes() == (whole / "episodes.csv").read_bytes()
     assert digest(out) == digest(whole)
     assert sorted(path.name for path in (out / "checkpoint").iterdir()) == ["00000002", "00000003"]
+
+
+OWN = {
+    "none": {},
+    "stack": {"frames": 2},
+    "gru": {"cell": 8, "auxiliary": True},
+    "along": {"auxiliary": True, "drives": 2, "drive_steps": 140},
+    "map": {"map_cell": 0.5},
+}
+
+
+@pytest.mark.parametrize("memory", OWN)
+def test_with_every_memory_a_run_goes_on_from_a_checkpoint_to_the_same_weights_to_the_bit(memory, tmp_path):
+    config = TrainConfig(memory=memory, n_envs=4, unroll=8, minibatches=2, epochs=1, hidden=(8,), **OWN[memory])
+    config = dataclasses.replace(config, steps=3 * config.steps_per_iteration)
+    world = open_world("StopAtShort-v1", "open:straight:train:2")
+    learner = make_learner(world, config)
+    run = folder.RunFolder(tmp_path / "run", world, learner)
+    run.start()
+    whole = train(learner, world.params, watch=lambda now: run.save(now) if now.iteration == 2 else None)
+    snapshot = run.resume()
+    assert snapshot.iteration == 2
+    again = train(learner, world.params, snapshot=snapshot)
+    jax.tree.map(np.testing.assert_array_equal, again.state, whole.state)
+    assert {**again.record, "timing": None} == {**whole.record, "timing": None}
 
 
 @pytest.mark.parametrize(
@@ -146,21 +176,6 @@ def test_seeds_go_on_from_the_newest_checkpoint_that_all_have(monkeypatch, kept,
     found = session.resume_seeds([seed(0), seed(1)])
     assert [None if one is None else one.iteration for one in found] == at
     assert all(kept[k] == [] for k in (0, 1) if at[k] is None)
-
-
-@pytest.mark.slow
-def test_of_several_seeds_those_without_a_common_checkpoint_begin_again(tunnel, tmp_path):
-    line = ("--task", TASK, "--tunnel", str(tunnel), "--preset", "cpu", *SMALL, *FEW, "--seeds", "0", "1")
-    assert call(navigate.main, *line, "--out", str(tmp_path / "whole")) == 0
-    shutil.copytree(tmp_path / "whole", tmp_path / "run")
-    # Killed between the first checkpoints: seed 0 has one, seed 1 none.
-    (tmp_path / "run" / "seeds.json").unlink()
-    shutil.rmtree(tmp_path / "run" / "seed-0" / "checkpoint" / "00000003")
-    shutil.rmtree(tmp_path / "run" / "seed-1" / "checkpoint")
-    assert call(navigate.main, *line, "--resume", "--out", str(tmp_path / "run")) == 0
-    for name in ("seed-0", "seed-1"):
-        assert log_without_timing(tmp_path / "run" / name) == log_without_timing(tmp_path / "whole" / name)
-        assert digest(tmp_path / "run" / name) == digest(tmp_path / "whole" / name)
 
 
 def test_an_overwritten_run_loses_its_checkpoints_before_anything_else(whole, tmp_path, monkeypatch):

@@ -5,7 +5,7 @@ import pytest
 import subterra_jax as st
 from tests.train import corridor
 from train.config import TrainConfig
-from train.driver import Driver, Policy
+from train.driver import Driver, Policy, Seen
 from train.learner import Learner
 from train.rollout import begin, collect
 from train.setup import make_layout
@@ -64,7 +64,7 @@ def test_a_truncated_episode_is_valued_at_its_final_observation_and_no_other_is(
     scan = env.draw_step(key_last, (N_ENVS,), params)
     observation = jax.vmap(env.observe, (0, 0, None))(stepped, scan, params)
     _, memory = driver.answer(policy, rollout.inputs[0], middle.memory)
-    kept = driver.take(policy, middle.kept, action, observation, params, stepped)
+    kept = driver.take(policy, middle.kept, action, Seen(observation, stepped.tunnel), params)
     value = driver.answer(policy, driver.inputs(policy, kept), memory)[0].value
     np.testing.assert_allclose(np.asarray(rollout.final_value)[0], value, atol=1e-4)
     assert np.abs(value - rollout.value[1]).max() > 1e-3

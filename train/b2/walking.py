@@ -107,28 +107,26 @@ class WalkDriver(Driver):
         """Returns statistics of no observation yet."""
         return learning.start_statistics((self._n,))
 
-    def begin(self, policy: Policy, observation: Array, params: Any, env_state: Any) -> Array:
+    @property
+    def n_action(self) -> int:
+        """Numbers of an action."""
+        return self.layout.shape.n_action
+
+    def see(self, observation: Array, env_state: Any) -> Array:
+        """Returns the observation."""
+        return observation
+
+    def begin(self, policy: Policy, seen: Array, params: Any) -> Array:
         """Returns the observation, which is all that is kept."""
-        return observation
+        return seen
 
-    def take(
-        self, policy: Policy, kept: Array, action: Array, observation: Array, params: Any, env_state: Any
-    ) -> Array:
+    def take(self, policy: Policy, kept: Array, action: Array, seen: Array, params: Any) -> Array:
         """Returns the observation."""
-        return observation
+        return seen
 
-    def go_on(
-        self,
-        policy: Policy,
-        kept: Array,
-        action: Array,
-        observation: Array,
-        done: Array,
-        params: Any,
-        env_state: Any,
-    ) -> Array:
+    def go_on(self, policy: Policy, kept: Array, action: Array, seen: Array, done: Array, params: Any) -> Array:
         """Returns the observation."""
-        return observation
+        return seen
 
     def inputs(self, policy: Policy, kept: Array) -> Array:
         """Returns the observation in standard deviations from its mean."""

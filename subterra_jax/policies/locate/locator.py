@@ -61,13 +61,11 @@ class Locator(Localiser):
 
     Attributes:
         weights: As `memory.init` makes them, trained.
-        network: Name of the memory.
         map: The map; None has none.
         blind: Leave the evidence out: the ablation that shows what the walls tell.
     """
 
     weights: Any
-    network: str = struct.field(pytree_node=False)
     map: MapStrip | None = None
     blind: bool = struct.field(pytree_node=False, default=False)
 
@@ -85,7 +83,7 @@ class Locator(Localiser):
             steps_before=zero,
             bend=zero,
             window=profiles.blank(WINDOW, strips.n_sides(params.lidar)),
-            cell=memory.start(self.network, self.weights),
+            cell=memory.start(),
             estimate=Estimate(zero, zero, jnp.log(jnp.full((), 0.05))),
             belief=None if self.map is None else map_filter.start(self.weights[memory.MAP], sigma),
             passed=zero,
@@ -100,37 +98,19 @@ class Locator(Localiser):
         now = dataclasses.replace(before, driven=at, reading=obs.distance, steps=before.steps + 1.0)
         ended = jnp.floor(at).astype(jnp.int32) > before.metres
         block, now = self._see(before, now, obs, driven, params)
-        cell, estimate = memory.step(self.network, self.weights, before.cell, block)
+        cell, estimate = memory.step(self.weights, before.cell, block)
         estimate, belief, passed = self._compare(before, now, estimate, params)
-        kept = (
-            before.cell,
-            before.estimate,
-            before.metres,
-            before.read_before,
-            before.steps_before,
-            before.belief,
-            before.passed,
-        )
-        new = (
-            cell,
-            estimate,
-            before.metres + 1,
-            before.read_before + block.read + 1.0,
-            before.steps_before + block.steps,
-            belief,
-            passed,
-        )
-        new = jax.tree.map(lambda one, old: jnp.where(ended, one, old), new, kept)
-        now = dataclasses.replace(
+        after = dataclasses.replace(
             now,
-            cell=new[0],
-            estimate=new[1],
-            metres=new[2],
-            read_before=new[3],
-            steps_before=new[4],
-            belief=new[5],
-            passed=new[6],
+            cell=cell,
+            estimate=estimate,
+            metres=before.metres + 1,
+            read_before=before.read_before + block.read + 1.0,
+            steps_before=before.steps_before + block.steps,
+            belief=belief,
+            passed=passed,
         )
+        now = jax.tree.map(lambda new, old: jnp.where(ended, new, old), after, now)
         since = at - now.metres
         station = now.begin + at + now.estimate.correction + now.estimate.share * since
         log_sigma = now.estimate.log_scale + jnp.log(_TO_SIGMA)

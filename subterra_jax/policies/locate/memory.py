@@ -1,4 +1,4 @@
-"""From metres to estimates: a network answers for each metre, and its answers are summed."""
+"""From metres to estimates: a transformer answers for each metre, and its answers are summed."""
 
 from typing import Any
 
@@ -7,24 +7,22 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from subterra_jax.policies.locate import map_filter, matching
+from subterra_jax.policies.locate import attention, map_filter, matching
+from subterra_jax.policies.locate.attention import HIDDEN, apply, dense
 from subterra_jax.policies.locate.blocks import DELAY, Block, Estimate, matched_inputs
-from subterra_jax.policies.locate.recurrent import CELLS, HIDDEN, apply, dense
 
 Weights = dict[str, Any]
 MAP = "map"  # the weights that take a map
-NETWORKS = tuple(CELLS)
-FRONTS = ("match", "wide")
 _COMPARED = {"match": matching.SHARES, "wide": matching.WIDE_SHARES}
 _UNIT = 0.02  # of the speed: answers of order 1
 
 
 @struct.dataclass
 class Sums:
-    """Memory of a network.
+    """Memory of the network.
 
     Attributes:
-        cell: Memory of its cell.
+        cell: Memory of the transformer.
         correction: Sum of its answers for the metres that all beams have passed, m.
         age: Metres so far.
     """
@@ -34,34 +32,23 @@ class Sums:
     age: Float[Array, ""]
 
 
-def init(network: str, front: str, key: PRNGKeyArray, with_map: bool = False) -> Weights:
+def init(front: str, key: PRNGKeyArray, with_map: bool = False) -> Weights:
     """Returns untrained weights of a localiser.
 
     Args:
-        network: One of `NETWORKS`.
-        front: One of `FRONTS`.
+        front: Errors of the command that are compared: `match` of slip, `wide` of wet rail too.
         key: Source of randomness.
-        with_map: Add the filter that takes a map.
-
-    Raises:
-        ValueError: There is no such network or front end, or a map shall be taken with errors as wide as wet rail's.
+        with_map: Add the filter that takes a map; with `match` alone.
     """
-    if with_map:
-        if front != "match":
-            raise ValueError(f"a map is taken with front match, not with {front}")
-        return {**init(network, front, key), MAP: map_filter.init(jax.random.fold_in(key, 2))}
-    if network not in NETWORKS or front not in FRONTS:
-        known = f"networks are {', '.join(NETWORKS)}; fronts are {', '.join(FRONTS)}"
-        raise ValueError(f"no network {network!r} with front {front!r}; {known}")
     keys = jax.random.split(key, 5)
-    n_in = len(_COMPARED[front]) + 4
-    return {
+    weights = {
         "match": matching.init(keys[0], _COMPARED[front]),
-        "in": dense(keys[1], n_in, HIDDEN),
+        "in": dense(keys[1], len(_COMPARED[front]) + 4, HIDDEN),
         "in_2": dense(keys[2], HIDDEN, HIDDEN),
-        "cell": CELLS[network].init(keys[3]),
+        "cell": attention.init(keys[3]),
         "out": dense(keys[4], HIDDEN, 3, 0.1),
     }
+    return {**weights, MAP: map_filter.init(jax.random.fold_in(key, 2))} if with_map else weights
 
 
 def front_of(tensors: Any) -> str:
@@ -79,38 +66,28 @@ def log_rate(estimate: Estimate, age: Array) -> Array:
     return estimate.log_scale - _log_scale(jnp.zeros(()), age)
 
 
-def start(network: str, weights: Weights) -> Any:
+def start() -> Sums:
     """Returns the memory at the start."""
-    return Sums(CELLS[network].start(), jnp.zeros(()), jnp.zeros(()))
+    return Sums(attention.start(), jnp.zeros(()), jnp.zeros(()))
 
 
-def step(network: str, weights: Weights, memory: Any, block: Block) -> tuple[Any, Estimate]:
+def step(weights: Weights, memory: Sums, block: Block) -> tuple[Sums, Estimate]:
     """Takes in one metre, and answers."""
-    cell, hidden = CELLS[network].step(weights["cell"], memory.cell, _embed(weights, block))
+    cell, hidden = attention.step(weights["cell"], memory.cell, _embed(weights, block))
     passed, coming, log_rate = _answers(weights, hidden)
     age = memory.age + 1.0
     correction = memory.correction + jnp.where(age > DELAY, passed, 0.0)
     ahead = jnp.minimum(age, DELAY) * coming
-    estimate = Estimate(correction + ahead, coming, _log_scale(log_rate, age))
-    return Sums(cell, correction, age), estimate
+    return Sums(cell, correction, age), Estimate(correction + ahead, coming, _log_scale(log_rate, age))
 
 
-def sequence(network: str, weights: Weights, blocks: Block) -> Estimate:
+def sequence(weights: Weights, blocks: Block) -> Estimate:
     """Returns the answers to all metres of a drive; fields of `blocks` have the metres as first axis."""
-    return summed(weights, hidden_rows(network, weights, blocks))
-
-
-def summed(weights: Weights, hidden: Float[Array, "t n"]) -> Estimate:
-    """Returns the answers of a network without a filter: its answers to the metres, summed."""
+    hidden = attention.sequence(weights["cell"], _embed(weights, blocks))
     passed, coming, log_rate = _answers(weights, hidden)
     age = jnp.arange(1.0, hidden.shape[0] + 1.0)
     correction = jnp.cumsum(jnp.where(age > DELAY, passed, 0.0))
     return Estimate(correction + jnp.minimum(age, DELAY) * coming, coming, _log_scale(log_rate, age))
-
-
-def hidden_rows(network: str, weights: Weights, blocks: Block) -> Float[Array, "t n"]:
-    """Returns what the cell of a network makes of all metres of a drive."""
-    return CELLS[network].sequence(weights["cell"], _embed(weights, blocks))
 
 
 def _embed(weights: Weights, block: Block) -> Array:

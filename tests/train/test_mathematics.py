@@ -1,0 +1,92 @@
+"""Advantages, running statistics and discounted returns against slow definitions."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from train import devices, learning
+
+
+def slow_advantages(reward, value, last_value, final_value, terminated, truncated, discount, gae_lambda):
+    """Straight from the definition: the discounted sum of one-step errors up to the end of the episode."""
+    n_steps, n_envs = reward.shape
+    result = np.zeros((n_steps, n_envs))
+    for env in range(n_envs):
+        for begin in range(n_steps):
+            weight = 1.0
+            for t in range(begin, n_steps):
+                if terminated[t, env]:
+                    following = 0.0
+                elif truncated[t, env]:
+                    following = final_value[t, env]
+                else:
+                    following = value[t + 1, env] if t + 1 < n_steps else last_value[env]
+                result[begin, env] += weight * (reward[t, env] + discount * following - value[t, env])
+                weight *= discount * gae_lambda
+                if terminated[t, env] or truncated[t, env]:
+                    break
+    return result
+
+
+def random_rollout(rng, n_steps=40, n_envs=7):
+    normal = lambda *shape: rng.standard_normal(shape).astype(np.float32)  # noqa: E731
+    terminated, truncated = rng.random((n_steps, n_envs)) < 0.1, rng.random((n_steps, n_envs)) < 0.1
+    assert (terminated & truncated).any()
+    assert (truncated & ~terminated).any()
+    return (
+        normal(n_steps, n_envs),
+        normal(n_steps, n_envs),
+        normal(n_envs),
+        normal(n_steps, n_envs),
+        terminated,
+        truncated,
+    )
+
+
+def test_advantages_equal_the_definition_with_both_ends_of_an_episode():
+    for seed in range(3):
+        data = random_rollout(np.random.default_rng(seed))
+        fast = learning.advantages(*(jnp.asarray(x) for x in data), discount=0.97, gae_lambda=0.9)
+        np.testing.assert_allclose(fast, slow_advantages(*data, 0.97, 0.9), rtol=1e-4, atol=1e-5)
+
+
+def test_advantages_have_no_mean_and_unit_spread_over_all_parts():
+    values = jnp.asarray(np.random.default_rng(0).normal(3.0, 5.0, (4, 8, 3)), jnp.float32)
+    alike = jax.vmap(lambda part: devices.normalised(part, ("part",)), axis_name="part")(values)
+    np.testing.assert_allclose(alike, devices.normalised(values, ()), atol=1e-5)
+    assert float(jnp.mean(alike)) == pytest.approx(0.0, abs=1e-5)
+    assert float(jnp.std(alike)) == pytest.approx(1.0, abs=1e-4)
+
+
+def test_running_statistics_equal_those_of_all_the_data_at_once():
+    rng = np.random.default_rng(0)
+    data = (rng.standard_normal((6, 50, 20, 3)) * [1.0, 5.0, 0.1] + [0.0, 20.0, -3.0]).astype(np.float32)
+    statistics = learning.start_statistics((3,))
+    for batch in data:
+        statistics = learning.update_statistics(statistics, jnp.asarray(batch))
+    np.testing.assert_allclose(statistics.mean, data.mean(axis=(0, 1, 2)), rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(statistics.std, data.std(axis=(0, 1, 2)), rtol=1e-4)
+
+
+def test_normalized_observations_have_no_mean_and_unit_variance():
+    data = jnp.asarray(np.random.default_rng(1).normal(7.0, 3.0, (1000, 2)), jnp.float32)
+    statistics = learning.update_statistics(learning.start_statistics((2,)), data)
+    normal = learning.normalize(data, statistics.mean, statistics.std)
+    np.testing.assert_allclose(normal.mean(axis=0), 0.0, atol=1e-4)
+    np.testing.assert_allclose(normal.std(axis=0), 1.0, rtol=1e-4)
+
+
+def test_a_reading_that_never_moved_stays_finite_and_clipped():
+    statistics = learning.update_statistics(learning.start_statistics((1,)), jnp.zeros((100, 1)))
+    assert float(learning.normalize(jnp.array([5.0]), statistics.mean, statistics.std)[0]) == 10.0
+
+
+def test_discounted_returns_begin_anew_with_every_episode_and_go_on_between_unrolls():
+    reward = jnp.ones((4, 1))
+    done = jnp.array([[False], [True], [False], [False]])
+    after, returns = learning.discounted_returns(jnp.array([4.0]), reward, done, 0.5)
+    np.testing.assert_allclose(returns[:, 0], [3.0, 2.5, 1.0, 1.5])
+    np.testing.assert_allclose(after, [1.5])
+    after, _ = learning.discounted_returns(after, reward[:1], jnp.array([[True]]), 0.5)
+    np.testing.assert_allclose(after, [0.0])
