@@ -67,6 +67,7 @@ class TrainConfig:
         half: Compute in bfloat16; weights stay float32.
         standing: Share of the largest speed by which the range of actions goes below 0, where a robot stands.
         init_std: Standard deviation of the untrained policy before the tanh, in units of half the action range.
+        init_turn: The same for the yaw rate; left out it is `init_std`.
         learning_rate: Learning rate of Adam, at the start and at most.
         last_rate: Share of the learning rate that is left in the last iteration; it falls evenly.
         target_kl: The learning rate falls where an update moves the policy further than about this divergence; 0 keeps
@@ -109,6 +110,7 @@ class TrainConfig:
     half: bool = False
     standing: float = 0.5
     init_std: float = 0.5
+    init_turn: float | None = None
     learning_rate: float = 4e-4
     last_rate: float = 1.0
     target_kl: float = 0.0

@@ -60,6 +60,7 @@ def make_layout(env: Any, params: Any, config: TrainConfig, given: Given | None 
         cell=config.cell if config.memory == "gru" else 0,
         way_at=WAY_AT if asks else None,
         init_std=config.init_std,
+        init_turn=config.init_turn,
         half=config.half,
     )
     low, high = (tuple(float(bound) for bound in side[:n_action]) for side in (bounds.low, bounds.high))

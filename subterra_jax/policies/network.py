@@ -12,6 +12,7 @@ from typing import Any
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
@@ -32,6 +33,7 @@ class Shape:
         way_at: Place in the inputs of the way to go over `inputs.FAR`, which the auxiliary head corrects; None has no
             such head.
         init_std: Standard deviation of the untrained policy before the tanh.
+        init_turn: The same for its second number, the yaw rate; None is `init_std`.
         half: Compute in bfloat16; weights and outputs stay float32.
         n_seen: Inputs that the actor sees; the critic sees all. 0 is all.
     """
@@ -44,6 +46,7 @@ class Shape:
     init_std: float = 0.5
     half: bool = False
     n_seen: int = 0
+    init_turn: float | None = None
 
 
 @struct.dataclass
@@ -147,7 +150,9 @@ class Network(nn.Module):
         dtype = jnp.bfloat16 if shape.half else jnp.float32
         self.actor = Perceptron((*shape.hidden, shape.n_action), 0.01, dtype)
         self.critic = Perceptron((*shape.hidden, 1), 1.0, dtype)
-        self.log_std = self.param("log_std", nn.initializers.constant(math.log(shape.init_std)), (shape.n_action,))
+        spread = np.full(shape.n_action, shape.init_std)
+        spread[1:2] = shape.init_turn or shape.init_std
+        self.log_std = self.param("log_std", lambda key: jnp.asarray(np.log(spread), jnp.float32))
         if shape.cell:
             self.cell = Cell(shape.cell, dtype)
         if shape.way_at is not None:
