@@ -25,6 +25,7 @@ def options(tmp_path_factory):
     return {"tunnel": str(path), "horizon": 20}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TRAINERS)
 def test_a_trainer_learns_from_two_updates_and_is_scored_after_each(name, options, monkeypatch):
     if name in NEEDS:
