@@ -78,7 +78,8 @@ def make_learner(world: World, config: TrainConfig) -> Trainable:
     env, params = world.env, world.params
     _check_world(env, params, config, given)
     split: Parts = SPLIT if config.parts > 1 else ()
-    map, localiser, shapes = None, None, None
+    map: Any = None
+    localiser, shapes = None, None
     if config.memory == "along":
         shapes, map = _shapes(given.localiser, config), map_strip(params.tunnel) if config.map else None
     else:
