@@ -11,11 +11,11 @@ import pytest
 import trimesh
 
 import subterra_jax as st
+from benchmarks.rays import planar as reference
 from scene.build import build
 from scene.config import BuildConfig, ReconstructConfig
 from scene.fitting.lining import LiningConfig
 from scene.writing.track import TrackConfig
-from subterra_jax.lidar import reference
 from subterra_jax.parts import Noise
 from tests.scene.clouds import curved_d_bore
 from tests.shared import METRO, needs_metro

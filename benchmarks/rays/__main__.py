@@ -9,9 +9,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import matplotlib.pyplot as plt
-import numpy as np
-from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
@@ -25,13 +22,11 @@ from benchmarks.rays.casting import (
     require_scene,
 )
 from benchmarks.records import Record, measured, write_records
-from benchmarks.results import environment_facts, png_bytes, write_file
+from benchmarks.results import environment_facts, write_file
 from subterra_jax.host.files import require_file
 from subterra_jax.tunnel.sources import load_tunnel
 
 SCHEMA = "subterra.rays/1"
-_INK, _GOAL, _EDGE = "#1b4965", "#c1121f", "#e09f3e"
-_BINS = np.logspace(-7, 1.5, 86)
 _progress = Console(stderr=True, highlight=False)
 
 
@@ -45,7 +40,7 @@ class RaysConfig:
         linings: Variants of the walls; all that have a mesh if not given.
         kinds: LiDARs to compare.
         seed: Seed for poses and beams.
-        out: JSON file to write; the figure with histograms is written beside it.
+        out: JSON file to write, and `records.json` beside it.
     """
 
     scene: Path = DEFAULT_SCENE
@@ -105,35 +100,8 @@ def table(comparisons: list[Agreement]) -> Table:
     return shown
 
 
-def histograms(comparisons: list[Agreement]) -> Figure:
-    """Draws one histogram of differences for each comparison; rays that pass an edge have their own colour."""
-    columns = min(2, len(comparisons))
-    rows = -(-len(comparisons) // columns)
-    size = (6.0 * columns, 2.6 * rows + 0.4)
-    figure, panels = plt.subplots(rows, columns, figsize=size, sharex=True, squeeze=False, layout="constrained")
-    for axes, one in zip(panels.flat, comparisons, strict=False):
-        kinds = (("passing no edge", ~one.edge, _INK), ("passing an edge", one.edge, _EDGE))
-        axes.hist(
-            [np.maximum(one.error[which], _BINS[0]) for _, which, _ in kinds], _BINS, stacked=True,
-            color=[colour for *_, colour in kinds], label=[label for label, *_ in kinds],
-        )  # fmt: skip
-        for goal in (one.median_goal, one.tail_goal) if one.judged else ():
-            axes.axvline(goal, color=_GOAL, lw=1.0, ls="--")
-        axes.set(xscale="log", yscale="log", ylim=(0.5, None))
-        axes.set_title(f"{one.title}: median {1e3 * np.median(one.error):.3g} mm", fontsize=9)
-        axes.grid(alpha=0.3)
-    for axes in panels.flat[len(comparisons) :]:
-        axes.set_visible(False)
-    for axes in panels[-1]:
-        axes.set_xlabel("difference from embree, m (dashed: goals for median and 99.9 %)")
-    for axes in panels[:, 0]:
-        axes.set_ylabel("rays")
-    panels[0, 0].legend(fontsize=8, loc="upper left")
-    return figure
-
-
 def write(path: Path, config: RaysConfig, comparisons: list[Agreement], rates: dict[str, float]) -> None:
-    """Writes the report as JSON and its figure beside it.
+    """Writes the report as JSON, and its records beside it.
 
     Raises:
         OutputError: A file cannot be written.
@@ -146,7 +114,6 @@ def write(path: Path, config: RaysConfig, comparisons: list[Agreement], rates: d
         "rays_per_second_3d": rates,
     }
     write_file(path, (json.dumps(content, indent=1, default=str) + "\n").encode())
-    write_file(path.with_suffix(".png"), png_bytes(histograms(comparisons), dpi=130))
     write_records(path.with_name("records.json"), records_of(config, comparisons))
 
 

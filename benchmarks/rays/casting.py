@@ -17,9 +17,9 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.command import BenchmarkError
 from benchmarks.fidelity.derive.surface import Caster
+from benchmarks.rays import planar as reference
 from scene.bore import load_bore
 from subterra_jax import lidar, lidar3d
-from subterra_jax.lidar import reference
 from subterra_jax.lidar3d.relief import Relief
 from subterra_jax.lidar3d.surface import SMALL, Triangles, join_surfaces, read_mesh, read_scene
 from subterra_jax.tunnel import Tunnel
@@ -124,9 +124,6 @@ def _percentiles(error: Float[np.ndarray, "k"]) -> dict[str, float]:
     return {**named, "max": float(error.max()), **within}
 
 
-_PLANAR_BATCH = 1000  # scans in a call
-
-
 def compare_planar(folder: Path, plan: TunnelPlan, lining: str, n_rays: int, seed: int) -> list[Agreement]:
     """Compares the planar LiDAR at random poses with the levelled mesh, and with the mesh as it is.
 
@@ -143,7 +140,7 @@ def compare_planar(folder: Path, plan: TunnelPlan, lining: str, n_rays: int, see
     """
     params = lidar.LidarParams()
     poses = reference.random_poses(plan, max(1, n_rays // params.n_beams), np.random.default_rng(seed))
-    ranges = _simulate_planar(plan, lining, poses, params)
+    ranges = reference.simulate(Tunnel.from_plan(plan, lining), poses, params).astype(np.float64)
     surface = reference_surface(folder, lining)
     station = load_bore(folder / "bore.npz").axis.local(surface.vertices)[0]
     level = surface.vertices.copy()
@@ -159,14 +156,6 @@ def compare_planar(folder: Path, plan: TunnelPlan, lining: str, n_rays: int, see
         _agreement(f"{title}, levelled mesh", cast_level, ranges, poses),
         _agreement(f"{title}, straight rays of a pitched LiDAR", cast_pitched, ranges, poses, judged=False),
     ]
-
-
-def _simulate_planar(plan: TunnelPlan, lining: str, poses: reference.Poses, params: lidar.LidarParams) -> np.ndarray:
-    tunnel = Tunnel.from_plan(plan, lining)
-    scan = jax.jit(jax.vmap(partial(lidar.scan, params=params), in_axes=(None, 0, 0, 0)))
-    parts = np.array_split(np.arange(len(poses.station)), -(-len(poses.station) // _PLANAR_BATCH))
-    ranges = [scan(tunnel, poses.position[i], poses.heading[i], poses.station[i]) for i in parts]
-    return np.concatenate([np.asarray(part) for part in ranges]).astype(np.float64)
 
 
 def _cast(

@@ -1,4 +1,4 @@
-"""Speed of the batched environment and of its peers, measured in one run with the exactness of its LiDAR.
+"""Speed of the batched environment and of JaxNav, measured in one run with the exactness of its LiDAR.
 
-config ─► measure (ours, floor, exactness), variants, peers, mujoco_route ─► timing ─► report
+config ─► measure (ours, floor, exactness), variants, peers ─► timing ─► report, figures
 """

@@ -1,7 +1,7 @@
 """Speed of the batched environment and of its peers, measured together with the exactness of its LiDAR.
 
 `python -m benchmarks.throughput --n 1024 4096 --lengths 351 3510 --linings smooth pockets furnished --out out/speed`
-`python -m benchmarks.throughput --task Subterra/StopAt-v1 --tunnel open:train:0-999 --n 65536`
+`python -m benchmarks.throughput --task Subterra/StopAt-v1 --tunnel open:train:0-999 --sensor spin16x64 --n 65536`
 """
 
 import sys
@@ -17,14 +17,8 @@ from benchmarks.results import environment_facts, write_file
 from benchmarks.throughput import report
 from benchmarks.throughput.config import ThroughputConfig, check
 from benchmarks.throughput.figures import records_of
-from benchmarks.throughput.measure import (
-    arithmetic_floor,
-    environment_loop,
-    floor_loop,
-    measure_exactness,
-    measure_exactness_of_many,
-)
-from benchmarks.throughput.peers import Route, find_peers, measure_peer
+from benchmarks.throughput.measure import environment_loop, floor_loop, measure_exactness, measure_exactness_of_many
+from benchmarks.throughput.peers import measure_jaxnav, require_jaxnav
 from benchmarks.throughput.timing import Timing, measure
 from benchmarks.throughput.variants import measure_lengths, measure_linings
 from subterra_jax.host.files import require_folder
@@ -39,7 +33,7 @@ def run(config: ThroughputConfig) -> report.Result:
     """Measures everything that the settings ask for.
 
     Raises:
-        SubterraError: A tunnel, lining, scene or peer is missing, or a setting is out of range.
+        SubterraError: A tunnel, lining or peer is missing, or a setting is out of range.
         ValueError: No such task.
         FloatingPointError: An observation or a reward is not finite.
     """
@@ -51,14 +45,12 @@ def run(config: ThroughputConfig) -> report.Result:
 
 
 def run_one(config: ThroughputConfig) -> report.Result:
-    """Measures in one tunnel, beside the peers that are installed, and as the tunnel gets longer or rougher."""
-    peers = find_peers(config.peers)
-    tunnel = config.scene / "tunnel.npz" if config.scene is not None and config.tunnel is None else config.tunnel
-    plan = st.load_tunnel(tunnel)
+    """Measures in one tunnel, beside JaxNav, and as the tunnel gets longer or rougher."""
+    if config.peers == "jaxnav":
+        require_jaxnav()
+    plan = st.load_tunnel(config.tunnel)
     lining = config.lining or plan.default_lining
-    env, params = st.make(config.task, plan, lining)
-    # The comparison with the reference and the paper's route use the whole tunnel, whichever piece the task uses.
-    whole = st.make(_WHOLE, plan, lining)[1]
+    env, params = st.make(config.task, plan, lining, sensor=config.sensor)
     for name in config.linings:
         plan.lining(name)
     segments = len(plan.lining(lining).segments)
@@ -66,14 +58,15 @@ def run_one(config: ThroughputConfig) -> report.Result:
     result, timing = _begin(config, facts, params)
     if config.poses:
         _progress.print(f"exactness: {config.poses:,} poses")
+        # The comparison with the reference uses the whole tunnel, whichever piece the task uses.
+        whole = st.make(_WHOLE, plan, lining)[1]
         result.exactness = measure_exactness(plan, lining, whole, config.poses, config.seed)
     _measure_speeds(result, env, params, timing)
-    route = Route(plan, lining, whole, config.scene)
-    for name, peer in peers.items():
-        result.peers.append(measure_peer(name, peer, config.sizes(), route, timing, _progress.print))
+    if config.peers != "none":
+        result.peers.append(measure_jaxnav(config.sizes(), timing, _progress.print))
     if config.lengths:
         _progress.print("lengths")
-        result.lengths = measure_lengths(plan, lining, config, timing)
+        result.lengths = measure_lengths(config, timing)
     if config.linings:
         _progress.print("linings")
         result.linings = measure_linings(plan, config, timing)
@@ -86,13 +79,13 @@ def run_many(config: ThroughputConfig, names: list[Any]) -> report.Result:
     Raises:
         BenchmarkError: Something is asked for that takes one tunnel.
     """
-    asked: dict[str, Any] = {name: getattr(config, name) for name in ("scene", "lengths", "linings")}
-    asked["peers"] = set(config.peers) - {"auto", "none"}
+    asked: dict[str, Any] = {name: getattr(config, name) for name in ("lengths", "linings")}
+    asked["peers"] = config.peers == "jaxnav"
     for option in (name for name, value in asked.items() if value):
         raise BenchmarkError(f"--{option} takes one tunnel, and there are {len(names) * config.copies}")
     _progress.print(f"{len(names)} tunnels")
     made = tunnels.load(names, config.lining)
-    env, params = st.make(config.task, tunnel=made * config.copies)
+    env, params = st.make(config.task, tunnel=made * config.copies, sensor=config.sensor)
     lengths = np.broadcast_to(np.asarray(params.tunnel.length), (params.tunnel.count,))
     facts = {
         "name": config.tunnel or "packaged",
@@ -113,7 +106,6 @@ def run_many(config: ThroughputConfig, names: list[Any]) -> report.Result:
 def _begin(config: ThroughputConfig, facts: dict[str, Any], params: Any) -> tuple[report.Result, Timing]:
     """Returns the results with nothing measured yet, and how it is timed."""
     result = report.Result(config, environment_facts(), facts, params.lidar.n_beams)
-    result.arithmetic = arithmetic_floor(result.environment["device"], result.n_beams)
     return result, Timing(config.steps, config.repeats, config.seconds, config.seed)
 
 
@@ -137,7 +129,6 @@ def run_and_report(config: ThroughputConfig) -> int:
     report.show(result, Console(highlight=False, emoji=False, width=None if sys.stdout.isatty() else 120))
     if config.out is not None:
         write_file(config.out / "throughput.json", report.as_json(result).encode())
-        write_file(config.out / "throughput.png", report.as_png(result))
         write_records(config.out / "records.json", records_of(result))
     if any(gate.n_wrong for gate in result.gates):
         print("error: the LiDAR disagrees with the reference, so its speed counts for nothing", file=sys.stderr)

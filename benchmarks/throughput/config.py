@@ -8,13 +8,12 @@ from typing import Literal
 import jax
 
 from benchmarks.command import BenchmarkError
+from subterra_jax.parts.spatial_lidar import SENSORS
 
 SIZES = (1, 16, 256, 1024, 4096, 16_384, 65_536, 262_144)
 _MOST_ON_CPU = 4096
 # Batch sizes for comparing lengths and linings: large enough that a step is mostly work, not overhead.
 _STUDY_SIZE_ON_CPU, _STUDY_SIZE = 1024, 65_536
-
-PeerChoice = Literal["auto", "none", "jaxnav", "gymnax", "mujoco"]
 
 
 @dataclass(frozen=True)
@@ -23,32 +22,31 @@ class ThroughputConfig:
 
     Attributes:
         n: Batch sizes to measure; 1 to 262,144 if not given, on a CPU to 4,096.
-        peers: Other environments to measure: `auto` (all installed), `none`, or names, which must be installed.
+        peers: JaxNav beside ours: `auto` (where it is installed), `jaxnav`, or `none`.
         task: Task id.
         tunnel: Tunnel file, or the name of a packaged one; the packaged default if not given. Several names, as
             `open:cast:train:0-9` or with commas between: each episode draws one of them.
         copies: Copies of each tunnel, in memory of their own.
-        scene: Scene folder for the paper's route, with its own `tunnel.npz` unless `tunnel` is given. Without it,
-            MuJoCo gets the tunnel's walls, extruded.
         lining: Variant of the walls; the tunnel's usual one if not given.
-        lengths: Tunnel lengths to compare, m; a tunnel too short is continued by mirrored copies.
+        sensor: LiDAR, the planar one or as `spin16x64`.
+        lengths: Lengths to compare, m, of the first tunnel if it is of the open world, else of a straight one of it.
         linings: Variants of the walls to compare.
         study_n: Batch size of those comparisons; 65,536 if not given, on a CPU 1,024.
         steps: Steps in one timed call, all within one `lax.scan`.
         repeats: Timed calls.
         seconds: Time limit for all calls of one size, s; a call gets fewer steps to keep to it.
-        poses: Random poses at which the LiDAR is compared with float64 brute force; 0 skips the comparison.
+        poses: Random poses at which the planar LiDAR is compared with float64 brute force; 0 skips the comparison.
         seed: Seed for actions, environments and poses.
-        out: Output folder for `throughput.json` and `throughput.png`.
+        out: Output folder for `throughput.json` and `records.json`.
     """
 
     n: tuple[int, ...] = ()
-    peers: tuple[PeerChoice, ...] = ("auto",)
+    peers: Literal["auto", "none", "jaxnav"] = "auto"
     task: str = "Subterra/Traverse-v1"
     tunnel: str | None = None
     copies: int = 1
-    scene: Path | None = None
     lining: str | None = None
+    sensor: str = SENSORS[0]
     lengths: tuple[float, ...] = ()
     linings: tuple[str, ...] = ()
     study_n: int | None = None
@@ -87,8 +85,6 @@ def check(config: ThroughputConfig) -> None:
     for name, value in (("seconds", config.seconds), *(("lengths", length) for length in config.lengths)):
         if not 0.0 < value < math.inf:
             raise BenchmarkError(f"--{name} must be positive, got {value}")
-    if len(config.peers) > 1 and {"auto", "none"} & set(config.peers):
-        raise BenchmarkError(f"--peers takes auto, none, or names, got {' '.join(config.peers)}")
 
 
 def _on_cpu() -> bool:

@@ -1,7 +1,6 @@
 """Loops to time: our environment, and the least that one of its shape must do; and the exactness of its LiDAR."""
 
 import dataclasses
-from functools import partial
 from typing import Any
 
 import jax
@@ -10,15 +9,8 @@ import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
 import subterra_jax as st
+from benchmarks.rays import planar as reference
 from benchmarks.throughput.timing import Carry, Loop, digest
-from subterra_jax import lidar
-from subterra_jax.lidar import reference
-
-# One wall of the window of a brute-force cast: two products and a comparison at each end, and the intersection.
-_SEGMENTS, _OPERATIONS = 300, 20
-# Lanes × clock, 1/s. Source: 132 multiprocessors of 128 float32 lanes (CUDA C++ Programming Guide, compute capability
-# 9.0) at the 1,980 MHz that the card reads under load.
-_LANES = {"NVIDIA H200": 132 * 128 * 1.98e9}
 
 
 def environment_loop(env: st.TunnelEnv, params: st.EnvParams, n_envs: int) -> Loop:
@@ -76,23 +68,6 @@ def floor_loop(loop: Loop) -> Loop:
     return dataclasses.replace(loop, step=step)
 
 
-def arithmetic_floor(device: str, n_beams: int) -> float | None:
-    """Returns the steps per second at which a brute-force cast of 300 segments a beam fills the device's lanes.
-
-    Args:
-        device: Device kind, as JAX names it.
-        n_beams: Beams in one scan.
-
-    Returns:
-        Steps per second; `None` for a device whose lanes and clock are not known here. A hierarchy may be faster.
-    """
-    return _LANES[device] / (n_beams * _SEGMENTS * _OPERATIONS) if device in _LANES else None
-
-
-# Poses scanned at a time, so that memory does not grow with their number.
-_BATCH = 1000
-
-
 def measure_exactness(
     plan: st.TunnelPlan, lining: str, params: st.EnvParams, n_poses: int, seed: int
 ) -> reference.Agreement:
@@ -106,12 +81,8 @@ def measure_exactness(
         seed: Seed for the poses.
     """
     poses = reference.random_poses(plan, n_poses, np.random.default_rng(seed))
-    scan = jax.jit(jax.vmap(partial(lidar.scan, params=params.lidar), in_axes=(None, 0, 0, 0)))
-    ranges = [
-        np.asarray(scan(params.tunnel, poses.position[rows], poses.heading[rows], poses.station[rows]))
-        for rows in np.array_split(np.arange(n_poses), max(1, n_poses // _BATCH))
-    ]
-    return reference.agreement(plan.lining(lining).segments, poses, np.concatenate(ranges))
+    ranges = reference.simulate(params.tunnel, poses, params.lidar)
+    return reference.agreement(plan.lining(lining).segments, poses, ranges)
 
 
 def measure_exactness_of_many(

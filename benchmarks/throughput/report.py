@@ -1,4 +1,4 @@
-"""One run's results: tables on a terminal, `throughput.json` and the figure."""
+"""One run's results: tables on a terminal, and `throughput.json`."""
 
 import dataclasses
 import json
@@ -6,19 +6,15 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
-import matplotlib.pyplot as plt
-import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.results import constants_facts, png_bytes
+from benchmarks.rays.planar import Agreement
+from benchmarks.results import constants_facts
 from benchmarks.throughput.config import ThroughputConfig
-from benchmarks.throughput.peers import ROUTE, Peer
+from benchmarks.throughput.peers import N_BEAMS, Peer
 from benchmarks.throughput.timing import Speed
 from benchmarks.throughput.variants import Variant
-from subterra_jax.lidar.reference import Agreement
 
 SCHEMA = "subterra.throughput/2"
 
@@ -35,8 +31,7 @@ class Result:
         exactness: Comparison of our LiDAR with the reference; `None` if skipped.
         speeds: Our speeds, one for each batch size.
         floor: Speeds of the same loop with nothing simulated.
-        arithmetic: Steps/s at which brute force fills the device's lanes; `None` where those are not known.
-        peers: Other environments, in the order of `--peers auto`.
+        peers: Other environments.
         lengths: Speeds in tunnels of several lengths.
         linings: Speeds in several linings of the tunnel.
     """
@@ -48,7 +43,6 @@ class Result:
     exactness: Agreement | None = None
     speeds: list[Speed] = field(default_factory=list)
     floor: list[Speed] = field(default_factory=list)
-    arithmetic: float | None = None
     peers: list[Peer] = field(default_factory=list)
     lengths: list[Variant] = field(default_factory=list)
     linings: list[Variant] = field(default_factory=list)
@@ -60,10 +54,8 @@ class Result:
         return [gate for gate in every if gate is not None]
 
     def ratios(self, peer: Peer) -> dict[int, float]:
-        """Returns our median over a peer's by batch size: at the same size, or over the route's only environment."""
+        """Returns our median over a peer's by batch size."""
         theirs = {speed.n_envs: speed.quartiles[1] for speed in peer.speeds}
-        if peer.name == ROUTE:
-            theirs = {speed.n_envs: theirs[1] for speed in self.speeds}
         return {s.n_envs: s.quartiles[1] / theirs[s.n_envs] for s in self.speeds if s.n_envs in theirs}
 
 
@@ -78,7 +70,6 @@ def as_json(result: Result) -> str:
         "exactness": None if result.exactness is None else dataclasses.asdict(result.exactness),
         "speed": [_speed(speed, result.n_beams) for speed in result.speeds],
         "floor": [_speed(speed, 0) for speed in result.floor],
-        "arithmetic_floor": result.arithmetic,
         "peers": [_peer(peer, result) for peer in result.peers],
         "lengths": [_variant(variant, result.n_beams) for variant in result.lengths],
         "linings": [_variant(variant, result.n_beams) for variant in result.linings],
@@ -94,7 +85,7 @@ def _speed(speed: Speed, n_beams: int) -> dict[str, Any]:
 
 def _peer(peer: Peer, result: Result) -> dict[str, Any]:
     return dataclasses.asdict(peer) | {
-        "speeds": [_speed(speed, peer.n_beams) for speed in peer.speeds],
+        "speeds": [_speed(speed, N_BEAMS) for speed in peer.speeds],
         "ratios": {str(n_envs): ratio for n_envs, ratio in result.ratios(peer).items()},
     }
 
@@ -143,7 +134,7 @@ def _speeds(result: Result) -> Table:
         "environment steps", ("who", "envs", "median /s", "quartiles", "ns per step", "rays /s", "compile, s")
     )
     measured: list[tuple[str, int, Iterable[Speed]]] = [("subterra", result.n_beams, result.speeds)]
-    measured += [(peer.name, peer.n_beams, peer.speeds) for peer in result.peers]
+    measured += [(peer.name, N_BEAMS, peer.speeds) for peer in result.peers]
     for name, n_beams, speeds in [*measured, ("floor", 0, result.floor)]:
         for speed in speeds:
             _, median, _ = speed.quartiles
@@ -198,57 +189,3 @@ def format_rate(value: float) -> str:
         if value >= unit:
             return f"{value / unit:.4g}{suffix}"
     return f"{value:.4g}"
-
-
-# Colours that colour-blind readers can tell apart (after Okabe and Ito); markers differ too.
-_OURS, _GREY = "#0072b2", "#777777"
-_PEERS = {"jaxnav": ("#d55e00", "s"), "gymnax": ("#009e73", "^"), "mujoco": ("#e69f00", "D")}
-_LABELS = {
-    "jaxnav": "JaxNav, {beams} beams",
-    "gymnax": "gymnax Pendulum, no sensor",
-    "mujoco": "paper's route, one environment",
-}
-
-
-def draw(result: Result) -> Figure:
-    """Draws steps per second against batch size; lines join medians, shades span the quartiles."""
-    figure, axes = plt.subplots(figsize=(7.5, 5), layout="constrained")
-    _line(axes, result.speeds, f"Subterra, {result.n_beams} beams", _OURS, "o", width=2.0)
-    for peer in result.peers:
-        colour, marker = _PEERS[peer.name]
-        label = _LABELS[peer.name].format(beams=peer.n_beams)
-        _line(axes, peer.speeds, label, colour, marker)
-        if peer.name == ROUTE and peer.speeds:
-            axes.axhline(peer.speeds[0].quartiles[1], color=colour, lw=0.8, ls=":")
-    _line(axes, result.floor, "floor in time: same loop, nothing simulated", _GREY, "", ls="--")
-    if result.arithmetic is not None:
-        axes.axhline(result.arithmetic, color=_GREY, lw=1.0, ls=":", label="brute force filling all lanes")
-    axes.set(xscale="log", yscale="log", xlabel="environments in the batch", ylabel="environment steps per second")
-    sizes = [speed.n_envs for speed in result.speeds]
-    axes.set_xticks(sizes, [f"{size:,}" for size in sizes], rotation=30)
-    axes.minorticks_off()
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize=8, loc="upper left")
-    facts, timing = result.environment, result.config
-    axes.set_title(
-        f"{facts['device']}, jax {facts['jax']}; {timing.task}, {result.tunnel['name']}, {result.tunnel['lining']}; "
-        f"median of {timing.repeats}",
-        fontsize=9,
-    )
-    return figure
-
-
-def as_png(result: Result) -> bytes:
-    """Returns the figure as a PNG file."""
-    return png_bytes(draw(result), dpi=150)
-
-
-def _line(
-    axes: Axes, speeds: list[Speed], label: str, colour: str, marker: str, width: float = 1.3, ls: str = "-"
-) -> None:
-    if not speeds:
-        return
-    size = [speed.n_envs for speed in speeds]
-    lower, median, upper = np.array([speed.quartiles for speed in speeds]).T
-    axes.plot(size, median, color=colour, marker=marker, ms=5, lw=width, ls=ls, label=label)
-    axes.fill_between(size, lower, upper, color=colour, alpha=0.2, lw=0)

@@ -1,6 +1,6 @@
 """The planar LiDAR and the clearance as kernels for NVIDIA GPUs: one thread serves one robot, in a warp of 32.
 
-Blocks are visited in the order of `tunnel.blocks.Order`: from the robot's place on, and then back, each way until the
+Blocks are visited in the order of `tunnel.order.Order`: from the robot's place on, and then back, each way until the
 plane at a block tells that nothing behind it is nearer than what has been met. Threads that have entered a block wait
 until some others have too, and then all meet their segments together.
 """

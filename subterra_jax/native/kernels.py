@@ -1,6 +1,6 @@
 """The planar LiDAR and the clearance for CPUs: plain loops over sixteen blocks, or sixteen segments, at a time.
 
-Blocks are visited in groups in the order of `tunnel.blocks.Order`, until the plane at a group's first block tells that
+Blocks are visited in groups in the order of `tunnel.order.Order`, until the plane at a group's first block tells that
 nothing behind it is nearer than what has been met. Arrays are flat, since a compiler makes vector instructions of their
 loops, and whole numbers without sign, since it then knows that none counts from an array's end.
 """

@@ -12,7 +12,8 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from subterra_jax.host.errors import TunnelError
-from subterra_jax.tunnel.blocks import PADDING_CENTRE, PADDING_THICKNESS, build_blocks, order, windows
+from subterra_jax.tunnel.blocks import PADDING_CENTRE, PADDING_THICKNESS, build_blocks
+from subterra_jax.tunnel.order import order, windows
 from subterra_jax.tunnel.packed import Packed, join, pack
 from subterra_jax.tunnel.plan import TunnelPlan
 
@@ -40,10 +41,10 @@ class Tunnel:
         grid: Centreline x, y (m), unit tangent x, y and half width (m) at each node of the station grid.
         scan_first: First block of the window that a LiDAR near each node can see.
         contact_first: First block of the window that a robot near each node can touch.
-        visit_first: First block at or beyond each node: beams visit blocks from there on, and back; see `blocks.Order`.
+        visit_first: First block at or beyond each node: beams visit blocks from there on, and back; see `order.Order`.
         box: Rows of the middle x, y of the box around each block, half its long axis as a vector x, y, half its
             thickness and half its length, m; and of the plane at each block: its normal x, y, and how far ahead and
-            behind it is, m; see `blocks.Order`. Padding, as before the first block, has a negative thickness, so that
+            behind it is, m; see `order.Order`. Padding, as before the first block, has a negative thickness, so that
             no beam enters it, and nothing beyond its plane.
         wall: Row of x and row of y of the vertices of each block, from the middle of its box, m; the last one repeated
             as padding.

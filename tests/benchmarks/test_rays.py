@@ -1,7 +1,6 @@
 """Rays of both LiDARs against embree in a small built scene, and in a spoiled one."""
 
 import json
-import re
 import shutil
 from pathlib import Path
 
@@ -9,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from benchmarks.rays import peers, picture, speed
+from benchmarks.rays import picture
 from benchmarks.rays.__main__ import RaysConfig, command, main, run
 from benchmarks.rays.casting import Agreement
 from scene.writing.folder import write_geometry
@@ -68,7 +67,7 @@ def test_a_wall_that_is_2_cm_off_is_noticed(scene: Path, tmp_path: Path) -> None
     assert report["schema"] == "subterra.rays/1"
     assert [one["holds"] for one in report["comparisons"]] == [False, True]
     assert report["comparisons"][0]["all"]["p50"] > 5e-3
-    assert out.with_suffix(".png").stat().st_size > 10_000
+    assert json.loads((tmp_path / "records.json").read_text())
 
 
 def test_a_ray_that_passes_an_edge_is_counted_and_told_apart() -> None:
@@ -111,29 +110,6 @@ def test_a_users_mistake_is_one_sentence_and_status_2(
     assert len(said) == 1
     assert said[0].startswith("error: ")
     assert complaint in said[0]
-
-
-def test_the_speed_of_a_batch_is_printed_and_a_folder_that_is_no_scene_refused(
-    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert speed.command(["--scene", str(scene), "--robots", "4", "--columns", "4", "--repeats", "1"]) == 0
-    assert re.search(r"4 robots x 64 beams: \S+ M rays/s .*surface \S+ MB", capsys.readouterr().out)
-    assert speed.command(["--scene", str(tmp_path)]) == 2
-    assert "is no built scene" in capsys.readouterr().err
-
-
-def test_peers_cast_the_same_rays_as_the_3d_lidar(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    rows = list(peers.measure(peers.PeersConfig(scene=scene, robots=2, repeats=1)))
-    names = [row.name for row in rows]
-    assert [name.split()[0] for name in names[:3]] == ["lidar3d.scan", "embree", "MuJoCo"]
-    for row in rows:
-        assert row.error.shape == (2048,)
-        assert np.median(row.error) < 1e-4, row.name
-        assert np.mean(row.error < 1e-3) > 0.998, row.name
-        assert row.rates.min() > 0.0
-    assert rows[0].n_bytes < 1e6  # 24 m of 7.9 MB for 351 m
-    assert peers.command(["--scene", str(scene / "nowhere")]) == 2
-    assert "is no built scene" in capsys.readouterr().err
 
 
 @pytest.mark.slow

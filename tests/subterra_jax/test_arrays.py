@@ -10,8 +10,8 @@ import pytest
 from scipy.spatial import KDTree
 
 import subterra_jax as st
+from benchmarks.rays import planar as reference
 from subterra_jax import lidar
-from subterra_jax.lidar import reference
 from subterra_jax.parts.unicycle import VehicleParams
 from subterra_jax.tunnel.arrays import ROBOT_RADIUS
 from subterra_jax.tunnel.distances import gaps_near

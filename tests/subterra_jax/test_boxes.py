@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from subterra_jax.lidar import reference
+from benchmarks.rays import planar as reference
 from subterra_jax.procedural import open_world
 from subterra_jax.tunnel import Tunnel, blocks, from_centreline
-from subterra_jax.tunnel.blocks import windows
 from subterra_jax.tunnel.distances import distance_to_segment
+from subterra_jax.tunnel.order import order, windows
 
 
 def test_the_box_of_a_turned_rectangle_is_that_rectangle():
@@ -88,7 +88,7 @@ def test_nothing_still_to_be_visited_lies_before_the_plane_at_a_block(name):
     plan = (st.load_tunnel(name) if name else st.load_tunnel()).slice(100.0, 90.0)
     cut = blocks.build_blocks(plan, plan.lining(plan.default_lining), 2.0, 16)
     first, count = windows(plan, cut, 12.0)
-    visits = blocks.order(plan, cut, first, count)
+    visits = order(plan, cut, first, count)
     assert np.hypot(*visits.normal.T).max() <= 1.0
     for node in range(0, len(plan.station), 15):
         start = int(visits.start[node])
@@ -110,6 +110,6 @@ def test_a_beam_visits_few_blocks_of_a_straight_tunnel():
     """The bound at a block of a straight tunnel is its own near end, but for the block beside it."""
     plan = from_centreline([[0.0, 0.0], [200.0, 0.0]], 2.5)
     cut = blocks.build_blocks(plan, plan.lining("smooth"), 2.0, 16)
-    visits = blocks.order(plan, cut, *windows(plan, cut, 30.0))
+    visits = order(plan, cut, *windows(plan, cut, 30.0))
     assert np.hypot(*cut.half.T).max() == pytest.approx(1.0, abs=0.3)
     assert min(visits.ahead.min(), visits.behind.min()) > -2.1

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
+from benchmarks.rays import planar as reference
 from subterra_jax import lidar
-from subterra_jax.lidar import gpu, nvidia, reference
+from subterra_jax.lidar import gpu, nvidia
 from subterra_jax.parts import unicycle
 from subterra_jax.tunnel import CONTACT_REACH, Tunnel, node_at, packed
 from subterra_jax.tunnel.tunnel import stack

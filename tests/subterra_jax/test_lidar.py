@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.rays import planar as reference
 from subterra_jax import lidar
-from subterra_jax.lidar import reference
 from subterra_jax.tunnel import Tunnel
 from subterra_jax.tunnel.plan import TunnelPlan
 from subterra_jax.tunnel.sources import load_tunnel

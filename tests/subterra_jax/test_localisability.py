@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
+from benchmarks.rays import planar as reference
 from subterra_jax.evaluation import bounds
 from subterra_jax.evaluation.localisability import Solid, localisability, marginal_bound, scan_information
-from subterra_jax.lidar import reference, scan
+from subterra_jax.lidar import scan
 from subterra_jax.lidar3d import Relief, beams
 from subterra_jax.tunnel import beside, from_centreline
 

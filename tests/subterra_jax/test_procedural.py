@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from subterra_jax.lidar import reference
+from benchmarks.rays import planar as reference
 from subterra_jax.procedural.geometry import Alignment, draw_alignment, wander
 from subterra_jax.procedural.open_world import LINE
 from subterra_jax.tunnel import kept, sources

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
+from benchmarks.rays import planar as reference
 from subterra_jax import lidar
-from subterra_jax.lidar import gpu, planar, reference
+from subterra_jax.lidar import gpu, planar
 from subterra_jax.parts import unicycle as vehicle
 from subterra_jax.tunnel import Tunnel, foot, node_at
 from subterra_jax.tunnel.tunnel import stack

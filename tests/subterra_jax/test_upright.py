@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
+from benchmarks.rays import planar as reference
 from subterra_jax import lidar, lidar3d
-from subterra_jax.lidar import reference
 from subterra_jax.lidar3d import beams
 from subterra_jax.tunnel import Tunnel
 

@@ -6,6 +6,7 @@ import sys
 import pytest
 
 import subterra_jax as st
+from benchmarks.rays import planar
 from benchmarks.results import environment_facts
 from benchmarks.throughput import __main__ as command
 from benchmarks.throughput import measure
@@ -20,14 +21,14 @@ def run_here(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     return command.main()
 
 
-def test_one_run_writes_speeds_the_papers_route_and_the_gate(tmp_path, monkeypatch):
-    size = ("--n", "8", "--steps", "4", "--repeats", "3", "--poses", "500", "--peers", "mujoco")
+def test_one_run_writes_speeds_and_the_gate(tmp_path, monkeypatch):
+    size = ("--n", "8", "--steps", "4", "--repeats", "3", "--poses", "500", "--peers", "none")
     arguments = ("--task", "Subterra/TraverseShort-v1", *size, "--out", str(tmp_path / "speed"))
     assert run_here(monkeypatch, *arguments) == 0
     result = json.loads((tmp_path / "speed" / "throughput.json").read_text())
     assert result["schema"] == "subterra.throughput/2"
     assert [speed["n_envs"] for speed in result["speed"]] == [8]
-    for speed in (*result["speed"], *result["floor"], *result["peers"][0]["speeds"]):
+    for speed in (*result["speed"], *result["floor"]):
         assert 0 < speed["q1"] <= speed["median"] <= speed["q3"]
         assert len(speed["steps_per_second"]) == 3
         assert speed["ns_per_step"] == pytest.approx(1e9 / speed["median"])
@@ -37,14 +38,8 @@ def test_one_run_writes_speeds_the_papers_route_and_the_gate(tmp_path, monkeypat
     assert result["exactness"]["max_error"] < 1e-3
     assert result["environment"]["jax"]
     assert result["environment"]["date"]
-    (route,) = result["peers"]
-    assert route["ratios"]["8"] == pytest.approx(result["speed"][0]["median"] / route["speeds"][0]["median"])
-    assert (tmp_path / "speed" / "throughput.png").read_bytes().startswith(b"\x89PNG")
-    assert sorted(path.name for path in (tmp_path / "speed").iterdir()) == [
-        "records.json",
-        "throughput.json",
-        "throughput.png",
-    ]
+    assert result["peers"] == []
+    assert sorted(path.name for path in (tmp_path / "speed").iterdir()) == ["records.json", "throughput.json"]
 
 
 @pytest.mark.parametrize(
@@ -54,17 +49,14 @@ def test_one_run_writes_speeds_the_papers_route_and_the_gate(tmp_path, monkeypat
         (("--lining", "velvet"), "velvet"),
         (("--linings", "smooth", "velvet"), "velvet"),
         (("--tunnel", "nowhere.npz"), "nowhere.npz"),
-        (("--scene", "nowhere"), "nowhere"),
+        (("--sensor", "nowhere"), "no sensor 'nowhere'"),
         (("--steps", "0"), "--steps"),
         (("--n", "0"), "0"),
         (("--lengths", "-5"), "-5"),
-        (("--peers", "auto", "mujoco"), "auto mujoco"),
     ],
 )
 def test_a_mistake_is_one_sentence_and_status_2(monkeypatch, capsys, arguments, named):
-    assert (
-        run_here(monkeypatch, *(a for a in QUICK if arguments[0] != "--peers" or a not in QUICK[-2:]), *arguments) == 2
-    )
+    assert run_here(monkeypatch, *QUICK, *arguments) == 2
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
     assert named in line
 
@@ -78,27 +70,28 @@ def test_several_tunnels_are_measured_together_and_compared_one_by_one(tmp_path,
     assert result["exactness"]["n_rays"] == 320
     assert result["exactness"]["n_wrong"] == 0
     assert ":train:" in capsys.readouterr().out, "a part of the name was taken for a picture"
-    true_scan = measure.lidar.scan
-    monkeypatch.setattr(measure.lidar, "scan", lambda *args, **rest: true_scan(*args, **rest) + 0.01)
+    true_scan = planar.lidar.scan
+    monkeypatch.setattr(planar.lidar, "scan", lambda *args, **rest: true_scan(*args, **rest) + 0.01)
     assert run_here(monkeypatch, *quick, *several) == 1
 
 
-@pytest.mark.parametrize("option", [("--lengths", "60"), ("--linings", "built"), ("--peers", "mujoco")])
+@pytest.mark.parametrize("option", [("--lengths", "60"), ("--linings", "built"), ("--peers", "jaxnav")])
 def test_what_takes_one_tunnel_is_refused_in_several(monkeypatch, capsys, option):
     assert run_here(monkeypatch, "--n", "2", "--tunnel", "open:cast:train:0-1", *option) == 2
     assert f"error: {option[0]}" in capsys.readouterr().err
 
 
 def test_a_peer_that_was_asked_for_and_is_not_there_is_a_mistake(monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "gymnax", None)
-    assert run_here(monkeypatch, "--peers", "gymnax") == 2
-    assert "peer 'gymnax' cannot be imported" in capsys.readouterr().err
+    monkeypatch.setitem(sys.modules, "jaxmarl", None)
+    monkeypatch.setitem(sys.modules, "jaxmarl.environments.jaxnav.jaxnav_env", None)
+    assert run_here(monkeypatch, "--peers", "jaxnav") == 2
+    assert "peer 'jaxnav' cannot be imported" in capsys.readouterr().err
 
 
 def test_a_lidar_that_is_a_centimetre_off_fails_the_run(monkeypatch, capsys):
-    plan, true_scan = st.load_tunnel().slice(0.0, 50.0), measure.lidar.scan
+    plan, true_scan = st.load_tunnel().slice(0.0, 50.0), planar.lidar.scan
     params = st.make("Subterra/Traverse-v1", plan)[1]
-    monkeypatch.setattr(measure.lidar, "scan", lambda *args, **rest: true_scan(*args, **rest) + 0.01)
+    monkeypatch.setattr(planar.lidar, "scan", lambda *args, **rest: true_scan(*args, **rest) + 0.01)
     gate = measure.measure_exactness(plan, "pockets", params, 20, seed=0)
     # Beams that leave through a mouth report the largest range, a centimetre more now.
     assert gate.n_wrong == gate.n_rays == 320

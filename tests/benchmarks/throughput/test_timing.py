@@ -7,7 +7,7 @@ import pytest
 
 import subterra_jax as st
 from benchmarks.throughput.config import ThroughputConfig
-from benchmarks.throughput.measure import arithmetic_floor, environment_loop, floor_loop
+from benchmarks.throughput.measure import environment_loop, floor_loop
 from benchmarks.throughput.timing import Loop, Timing, digest, measure, measure_in_turn, prepare
 
 
@@ -67,11 +67,6 @@ def test_the_floor_reads_and_writes_every_leaf_and_simulates_nothing():
     assert np.all(np.asarray(state["heading"]) != 0.0)
     assert np.ptp(np.asarray(obs), axis=1).max() == 0.0
     assert done == 0.0
-
-
-def test_the_arithmetic_floor_of_an_h200_is_that_of_96_thousand_operations_a_step():
-    assert 1e9 / arithmetic_floor("NVIDIA H200", 16) == pytest.approx(2.87, abs=0.01)
-    assert arithmetic_floor("abacus", 16) is None
 
 
 def test_sizes_are_measured_once_each_and_stop_at_4096_on_a_cpu(monkeypatch):

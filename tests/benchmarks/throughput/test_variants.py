@@ -1,66 +1,26 @@
-"""A tunnel continued by copies of itself is still a tunnel."""
+"""What a step costs in longer tunnels and in other linings."""
 
-from dataclasses import replace
-
-import numpy as np
 import pytest
 
 import subterra_jax as st
-from benchmarks.throughput.measure import measure_exactness
-from benchmarks.throughput.variants import extend_tunnel
+from benchmarks.throughput.config import ThroughputConfig
+from benchmarks.throughput.timing import Timing
+from benchmarks.throughput.variants import measure_lengths, measure_linings
+
+CONFIG = ThroughputConfig(study_n=4, poses=400, lengths=(60.0, 110.0), linings=("smooth", "pockets"))
+TIMING = Timing(steps=2, repeats=2)
 
 
-@pytest.fixture(scope="module")
-def plan() -> st.TunnelPlan:
-    whole = st.load_tunnel()
-    return replace(whole, linings={name: whole.lining(name) for name in ("smooth", "pockets")})
+def test_lengths_are_timed_in_turn_in_tunnels_of_these_lengths_with_an_exact_lidar():
+    short, long = measure_lengths(CONFIG, TIMING)
+    assert (short.name, long.name) == ("60 m", "110 m")
+    assert long.n_segments == pytest.approx(short.n_segments * 110 / 60, rel=0.15)
+    assert short.cost == (1.0, 1.0, 1.0)
+    assert [(one.exactness.n_rays, one.exactness.n_wrong) for one in (short, long)] == [(640, 0)] * 2
 
 
-def test_a_shorter_one_is_a_slice(plan):
-    part = extend_tunnel(plan, 100.0)
-    assert part.length == pytest.approx(100.0)
-    np.testing.assert_allclose(part.centre[0], plan.centre[0])
-
-
-def test_ten_in_a_row_are_ten_times_as_long_and_have_no_kink(plan):
-    long = extend_tunnel(plan, 3510.0)
-    assert long.length == pytest.approx(3510.0)
-    step = np.diff(long.centre, axis=0)
-    spacing = np.linalg.norm(step, axis=1)
-    np.testing.assert_allclose(spacing, long.station[1], rtol=0.01)
-    turn = np.abs(np.diff(np.unwrap(np.arctan2(step[:, 1], step[:, 0]))))
-    original = np.diff(plan.centre, axis=0)
-    assert turn.max() < np.abs(np.diff(np.unwrap(np.arctan2(original[:, 1], original[:, 0])))).max() + 0.01
-    np.testing.assert_allclose(np.linalg.norm(long.tangent, axis=1), 1.0, atol=1e-9)
-
-
-def test_left_stays_left_and_walls_keep_their_distance(plan):
-    long = extend_tunnel(plan, 900.0)
-    for side, sign in (("left", 1.0), ("right", -1.0)):
-        wall = getattr(long.lining("smooth"), side)
-        assert np.all(np.diff(wall.station) >= 0.0)
-        centre, tangent = (
-            np.stack([np.interp(wall.station, long.station, v[:, k]) for k in (0, 1)], axis=1)
-            for v in (long.centre, long.tangent)
-        )
-        offset = wall.vertex - centre
-        lateral = sign * (tangent[:, 0] * offset[:, 1] - tangent[:, 1] * offset[:, 0])
-        half_width = np.interp(wall.station, long.station, long.half_width)
-        assert np.abs(lateral - half_width).max() < 0.4
-        assert np.median(np.abs(lateral - half_width)) < 0.05
-
-
-def test_it_does_not_meet_itself(plan):
-    long = extend_tunnel(plan, 3510.0)
-    node = long.centre[:: max(1, len(long.centre) // 700)]
-    station = np.linspace(0.0, long.length, len(node))
-    distance = np.hypot(*(node[:, None, k] - node[None, :, k] for k in (0, 1)))
-    assert distance[np.abs(station[:, None] - station[None, :]) > 100.0].min() > 70.0
-
-
-def test_its_lidar_is_exact_across_the_seams(plan):
-    long = extend_tunnel(plan.slice(0.0, 40.0), 110.0)
-    _, params = st.make("Subterra/Traverse-v1", long)
-    gate = measure_exactness(long, "pockets", params, 300, seed=0)
-    assert gate.n_wrong == 0
-    assert gate.n_rays == 4800
+def test_linings_are_timed_in_turn_in_the_same_tunnel():
+    smooth, pockets = measure_linings(st.load_tunnel().slice(0.0, 40.0), CONFIG, TIMING)
+    assert pockets.n_segments > smooth.n_segments
+    assert pockets.exactness.n_wrong == smooth.exactness.n_wrong == 0
+    assert min(pockets.cost) > 0.0

@@ -1,14 +1,18 @@
-"""Reference for the LiDAR: float64 brute force against every segment of the tunnel's polylines.
+"""Reference for the planar LiDAR: float64 brute force against every segment of the tunnel's polylines.
 
-NumPy on the host, sharing no code with the casting on the device. Slow, and used by the tests and the benchmark alone.
+NumPy on the host, sharing no code with the casting on the device; slow. The tests use it too.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 
+import jax
 import numpy as np
 
+from subterra_jax import lidar
+from subterra_jax.tunnel import Tunnel
 from subterra_jax.tunnel.plan import TunnelPlan
 
 # Numbers in one chunk of the table of rays by points; small enough to stay in a processor's cache.
@@ -99,6 +103,14 @@ def clearance(segments: np.ndarray, position: np.ndarray) -> np.ndarray:
         share = np.clip(np.sum((p - start) * edge, axis=1) / np.maximum(np.sum(edge * edge, axis=1), 1e-300), 0.0, 1.0)
         nearest[i] = np.sqrt(np.min(np.sum((start + share[:, None] * edge - p) ** 2, axis=1)))
     return nearest
+
+
+def simulate(tunnel: Tunnel, poses: Poses, params: lidar.LidarParams, batch: int = 1000) -> np.ndarray:
+    """Return the ranges that the LiDAR on this device has at some poses, m, `(n, n_beams)`, some poses at a time."""
+    one = jax.jit(jax.vmap(partial(lidar.scan, params=params), in_axes=(None, 0, 0, 0)))
+    parts = np.array_split(np.arange(len(poses.station)), -(-len(poses.station) // batch))
+    ranges = [one(tunnel, poses.position[i], poses.heading[i], poses.station[i]) for i in parts]
+    return np.concatenate([np.asarray(part) for part in ranges])
 
 
 @dataclasses.dataclass(frozen=True)
