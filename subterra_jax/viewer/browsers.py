@@ -147,10 +147,6 @@ _TIMEOUT = 20.0  # s
 def save_picture(client: viser.ClientHandle, path: Path) -> None:
     """Let a browser render its view, write it to a PNG, and offer it to the browser as a download.
 
-    Args:
-        client: The browser.
-        path: Path of the PNG.
-
     Raises:
         ViewerError: The browser sent no picture.
         OutputError: The file cannot be written.

@@ -72,13 +72,13 @@ def drive_episode(
 
     Args:
         plan: The tunnel.
-        digest: SHA-256 of the tunnel.
-        title: Name of the tunnel.
-        lining: Variant of its walls.
-        task: Id of the task.
-        agent: Name of the driver.
+        digest: SHA-256 of the tunnel, for the recording.
+        title: Name of the tunnel, for the recording.
+        lining: As for `subterra_jax.make`.
+        task: As for `subterra_jax.make`.
+        agent: As for `policies.open_agent`.
         seed: Seed of the episode.
-        sensor: The robot's LiDAR.
+        sensor: As for `subterra_jax.make`.
 
     Raises:
         SubterraError: The agent does not exist, or does not fit the task.
@@ -96,13 +96,7 @@ _GENERATED = ("control", "open:val:0", "open:val:1", "open:val:2")
 
 @dataclasses.dataclass(frozen=True)
 class TunnelEntry:
-    """A tunnel to choose.
-
-    Attributes:
-        title: Name in the list.
-        source: File or name for `load_tunnel`.
-        scene: Scene folder with lining and track; `None` if there is only the plan.
-    """
+    """A tunnel to choose: its name in the list, its file or name for `load_tunnel`, and its scene folder, if any."""
 
     title: str
     source: str
@@ -110,15 +104,7 @@ class TunnelEntry:
 
 
 class Library:
-    """The tunnels, agents and recordings of a config.
-
-    Args:
-        config: Config of the viewer.
-
-    Attributes:
-        tunnels: Tunnels by title.
-        agents: Names of the agents.
-        sensor: The robot's LiDAR.
+    """The tunnels, by title, the agents, by name, and the recordings of a config.
 
     Raises:
         SubterraError: A tunnel or policy cannot be read, or the driver does not exist.
@@ -198,10 +184,7 @@ def cut_piece(plan: TunnelPlan, length: float) -> TunnelPlan:
 class TunnelView:
     """Shows one tunnel at a time: its plan or lining at once, every detail as soon as it has been read.
 
-    Args:
-        scene_view: Scene to show it in.
-        library: Tunnels to choose from.
-        report_error: Called with a sentence if the details of a scene cannot be read.
+    `report_error` is called with a sentence if the details of a scene cannot be read.
     """
 
     def __init__(self, scene_view: SceneView, library: Library, report_error: Callable[[str], None]):

@@ -179,16 +179,7 @@ class Choice:
 
 
 class Panel:
-    """The controls; the session attaches their effects.
-
-    Args:
-        server: Server of the page.
-        first: First choice.
-        tunnels: Titles of the tunnels.
-        tasks: Ids of the tasks.
-        agents: Names of the agents.
-        recordings: Names of the recorded episodes.
-    """
+    """The controls, with the names to choose from; the session attaches their effects."""
 
     def __init__(
         self,

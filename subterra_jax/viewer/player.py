@@ -140,8 +140,7 @@ Job = Callable[[Callable[[], bool]], None]
 class Worker:
     """Runs the newest job on its own thread; a running job can ask whether a newer one waits.
 
-    Args:
-        report_error: Called with a sentence if a job fails.
+    `report_error` is called with a sentence if a job fails.
     """
 
     def __init__(self, report_error: Callable[[str], None]):

@@ -63,15 +63,7 @@ def quaternion_about_z(angle: float) -> tuple[float, float, float, float]:
 
 
 class WheeledRobot:
-    """A small four-wheeled carrier with a LiDAR on a mast, as wide as the robot's footprint.
-
-    Args:
-        scene: Scene to draw it in.
-        mesh: Mesh from `robot_mesh`.
-
-    Attributes:
-        nodes: Its one node.
-    """
+    """A small four-wheeled carrier with a LiDAR on a mast, as wide as the robot's footprint; `mesh` is `robot_mesh`."""
 
     def __init__(self, scene: viser.SceneApi, mesh: "trimesh.Trimesh"):
         self.nodes = [scene.add_mesh_trimesh("/robot", mesh, cast_shadow=False)]
@@ -106,14 +98,7 @@ def robot_mesh(radius: float, lidar_height: float) -> "trimesh.Trimesh":
 
 
 class LeggedRobot:
-    """A Unitree B2: one node for each of its thirteen bodies, placed by MuJoCo's kinematics.
-
-    Args:
-        scene: Scene to draw it in.
-
-    Attributes:
-        nodes: One for each body.
-    """
+    """A Unitree B2: one node for each of its thirteen bodies, placed by MuJoCo's kinematics."""
 
     def __init__(self, scene: viser.SceneApi):
         import mujoco  # takes a second; most episodes have wheels
@@ -171,11 +156,7 @@ def _tail(share: float) -> np.ndarray:
 
 
 class SceneView:
-    """All nodes of the scene; any thread may change them.
-
-    Args:
-        server: Server of the page.
-    """
+    """All nodes of the scene; any thread may change them."""
 
     def __init__(self, server: viser.ViserServer):
         self._server, self._lock = server, threading.RLock()

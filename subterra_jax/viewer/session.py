@@ -28,16 +28,7 @@ _PANEL_PERIOD = 0.2  # s, between two updates of text and charts: faster text ca
 class EpisodeView:
     """The episode on screen, shared by all who have the page open.
 
-    Args:
-        server: Server of the page.
-        panel: Controls, updated with the episode.
-        library: Tunnels and episodes.
-        report_error: Called with a sentence if the details of a scene cannot be read.
-
-    Attributes:
-        scene_view: Nodes of the scene.
-        tunnel_view: Tunnel in the scene.
-        player: Clock of the replay.
+    `report_error` is called with a sentence if the details of a scene cannot be read.
     """
 
     def __init__(
@@ -156,18 +147,7 @@ class EpisodeView:
 
 
 class Session:
-    """The controls and their effects, shared by all who have the page open.
-
-    Args:
-        server: Server of the page.
-        config: First choice.
-        library: Tunnels, agents and episodes to choose from.
-
-    Attributes:
-        panel: Controls.
-        view: Episode on screen.
-        worker: Thread for long jobs.
-    """
+    """The controls and their effects, shared by all who have the page open."""
 
     def __init__(self, server: viser.ViserServer, config: ViewerConfig, library: Library):
         self._server, self._library = server, library
@@ -281,15 +261,7 @@ class Session:
 
 
 class Viewer:
-    """A running viewer.
-
-    Args:
-        config: Scene, task and address.
-
-    Attributes:
-        server: Server of the page.
-        url: Address of the page.
-        session: Session that all browsers share.
+    """A running viewer, its page at `url`; all browsers share one session.
 
     Raises:
         SubterraError: A file, task, driver or port of the config is not available.

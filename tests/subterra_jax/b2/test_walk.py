@@ -159,9 +159,10 @@ def test_a_robot_that_leaves_the_numbers_is_a_fall_and_spoils_nobody(walking):
     assert np.isfinite(reward).all()
 
 
-def beside(walking, state, lateral):
+@jax.jit
+def moved_aside(track, state, lateral):
     """The same robots moved aside to that lateral offset, m."""
-    turned = walking.params.track.quaternion[state.anchor]
+    turned = track.quaternion[state.anchor]
     aim = jax.vmap(rotate, in_axes=(0, None))(turned, jnp.array([0.0, 1.0, 0.0]))
     away = lateral - jax.vmap(locate)(state.body, turned).lateral
     aside = state.body.qpos.at[:, :3].add(away[:, None] * aim)
@@ -170,14 +171,14 @@ def beside(walking, state, lateral):
 
 def test_a_wall_is_told_as_contact(walking):
     _, state = walking.reset(11)
-    assert walking.step(11, beside(walking, state, 2.7))[5]["contact"].all()
+    assert walking.step(11, moved_aside(walking.params.track, state, 2.7))[5]["contact"].all()
     assert not walking.step(11, state)[5]["contact"].any()
 
 
 def test_a_wall_stops_a_robot_that_is_told_to_walk_through_it(walking):
     params = walking.told((0.0, 0.3, 0.0))
     _, state = walking.reset(12, params)
-    state, reached, touched = beside(walking, state, 2.3 * state.facing), [], False
+    state, reached, touched = moved_aside(walking.params.track, state, 2.3 * state.facing), [], False
     for k in range(150):
         _, state, _, _, _, info = walking.step(k, state, params=params)
         reached.append(np.abs(info["lateral"]))
@@ -187,12 +188,15 @@ def test_a_wall_stops_a_robot_that_is_told_to_walk_through_it(walking):
     assert 2.45 < np.max(reached) < 2.825 - 0.1
 
 
+pushed = jax.jit(physics.wall_wrench)
+
+
 def wrench(lateral, speed=0.0, half_width=2.8):
     """Of the walls on a robot that far to the left, moving there."""
     qpos = jnp.zeros(19).at[1].set(lateral).at[2].set(0.5).at[3].set(1.0)
     body = Body(qpos, jnp.zeros(18).at[1].set(speed), jnp.zeros(18))
     around = Surroundings((jnp.zeros((7, 3)), jnp.zeros((7, 4))), jnp.array([1.0, 0, 0, 0]), jnp.float32(half_width))
-    return np.asarray(physics.wall_wrench(body, around))
+    return np.asarray(pushed(body, around))
 
 
 def test_walls_push_back_where_the_robot_is_in_them_and_nowhere_else():

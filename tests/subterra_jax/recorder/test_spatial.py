@@ -15,7 +15,7 @@ from subterra_jax.recorder.messages import POINT
 def config(tmp_path_factory):
     out = tmp_path_factory.mktemp("spatial") / "o"
     config = RecorderConfig(
-        out=out, task="TraverseShort", tunnel="metro", lining="smooth", sensor="spin16x64", steps=4, every=2
+        out=out, task="TraverseShort", tunnel="subterra-351", lining="smooth", sensor="spin16x64", steps=4, every=2
     )
     record(config)
     return config
@@ -36,7 +36,7 @@ def test_its_points_lie_on_the_wall_by_the_true_pose(config):
     assert set(np.unique(rows["ring"])) <= set(range(16))
     elevation = np.rad2deg(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))
     np.testing.assert_allclose(elevation, -15.0 + 2.0 * rows["ring"], atol=0.1)
-    shell = st.load_tunnel("metro", solid=True).shell
+    shell = st.load_tunnel(config.tunnel, solid=True).shell
     off = [depth(shell, points, config, lift) for lift in (0.0, 0.5)]
     assert np.median(np.abs(off[0])) < 0.06
     assert np.median(np.abs(off[1])) > 0.1, "half a metre goes unnoticed"
