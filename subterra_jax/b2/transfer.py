@@ -1,6 +1,6 @@
 """Navigation from wheels to legs: a planar stand-in on which it is cheap to learn, and the trial on many B2s.
 
-The stand-in obeys late and nods, as the walking robot does. `identify` measures its lags from a run of that robot.
+The stand-in obeys late and nods, as the walking robot does.
 """
 
 import dataclasses
@@ -117,31 +117,6 @@ def stand_in(env: TunnelEnv, lag: Lag = Lag(), nod: Nod = Nod()) -> TunnelEnv:
     """
     parts = tuple(NoddingLidar(nod) if part.name == PlanarLidar.name else part for part in env.parts)
     return dataclasses.replace(env, motion=LaggedWheels(lag), parts=parts)
-
-
-def identify(commands: Float[np.ndarray, "n 2"], motions: Float[np.ndarray, "n 2"], period: float) -> Lag:
-    """Identifies the lags and gains of a run.
-
-    Args:
-        commands: Commanded speed (m/s) and yaw rate (rad/s) of each step.
-        motions: Speed and yaw rate of the robot in each step.
-        period: Length of a step, s.
-
-    Returns:
-        Least squares of `y[k] = a y[k-1] + b u[k]`: gain b / (1 - a), time constant -period / ln a.
-
-    Raises:
-        ValueError: A command was never varied, or the motion does not follow it.
-    """
-    fits = []
-    for name, u, y in zip(("speed", "yaw rate"), commands.T, motions.T, strict=True):
-        design = np.column_stack([y[:-1], u[1:]])
-        (a, b), _, rank, _ = np.linalg.lstsq(design, y[1:], rcond=None)
-        if rank < 2 or not 0.0 < a < 1.0 or b <= 0.0:
-            raise ValueError(f"the {name} does not follow its command: y[k] = {a:.3g} y[k-1] + {b:.3g} u[k]")
-        fits.append((-period / np.log(a), b / (1.0 - a)))
-    (speed, speed_gain), (yaw_rate, yaw_rate_gain) = fits
-    return Lag(float(speed), float(yaw_rate), float(speed_gain), float(yaw_rate_gain))
 
 
 @struct.dataclass

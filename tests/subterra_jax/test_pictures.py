@@ -76,6 +76,7 @@ def test_each_tunnel_of_a_list_is_drawn_by_its_number(plan):
     choice = TunnelChoice([plan, "control"], piece=(10.0, 60.0))
     assert choice.plan(0).name == "metro"
     assert choice.plan(1).length == pytest.approx(60.0)
+    assert TunnelChoice("open:val:0-2").plan(1).name == st.load_tunnel("open:val:1").name
     ready = st.make("Subterra/TraverseShort-v1")[1].tunnel
     with pytest.raises(ValueError, match="holds no heights"):
         TunnelChoice(ready).plan(0)
