@@ -33,7 +33,7 @@ def test_its_facts_say_that_it_meets_its_goals_on_a_thousand_robots(gait):
     assert scores["yaw_rate_error"] <= 0.15
 
 
-@pytest.mark.parametrize("speed", [1.0, -0.3])
+@pytest.mark.parametrize("speed", [1.0, 0.5, -0.3])
 def test_it_walks_as_told_over_sleepers_with_pushes_and_noise(gait, walking, speed):
     """Four seconds of eight robots; the facts are of a thousand robots for twenty."""
     low, high = jnp.array([speed, -0.3, -0.8]), jnp.array([speed, 0.3, 0.8])
