@@ -88,7 +88,6 @@ assert max(jax.tree.leaves(moved)) > 1e-6
 """
 
 
-@pytest.mark.slow
 def test_two_devices_come_to_what_one_does_and_go_on_from_its_state(tunnel):
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
     environment = {**os.environ, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags}
