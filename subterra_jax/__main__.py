@@ -57,7 +57,7 @@ def _read(words: list[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="subterra",
         description="Navigation without GNSS in tunnels.",
-        epilog=f"commands:\n{lines}\n\n`subterra COMMAND --help` shows the options of one.",
+        epilog=f"commands:\n{lines}\n\nExample: python -m subterra_jax tasks",
         formatter_class=argparse.RawDescriptionHelpFormatter,
         usage="subterra COMMAND ...",
     )

@@ -15,6 +15,7 @@ JUNK = bytes(range(256)) * 8
 # Command line → what its sentence must say. `text.txt` is a file, `empty` a folder, `junk.*` are bytes of no kind,
 # `tunnel` is a scene folder of such bytes, /proc a folder in which nobody can write.
 MISTAKES = {
+    "subterra_jax tain": "invalid choice: 'tain'",
     "scene.survey": "missing: --out",
     "scene.survey --out text.txt": "text.txt",
     "scene.survey --out o --truth moon": "'moon'",
