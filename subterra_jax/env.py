@@ -24,12 +24,10 @@ class Box:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Shape of one element."""
         return self.low.shape
 
     @property
     def dtype(self) -> Any:
-        """Type of the numbers, float32."""
         return self.low.dtype
 
     def sample(self, key: PRNGKeyArray) -> Float[Array, "*shape"]:

@@ -88,10 +88,15 @@ def _find(params: EnvParams, name: str) -> Array:
             raise ValueError(f"{name!r} cannot be randomised: the tunnel is one for all; stack several instead")
         if not fields[part]:
             raise ValueError(f"{name!r} cannot be randomised: it is static, because the shape of arrays depends on it")
-        node = getattr(node, part)
+        node = _entry(node, part)
     if node is None or dataclasses.is_dataclass(node):
         raise ValueError(f"{name!r} is no number" if node is not None else f"this task has no {name!r} to randomise")
     return jnp.asarray(node)
+
+
+def _entry(node: Any, name: str) -> Any:
+    """An entry of the params, or a field of it."""
+    return node.parts[name] if isinstance(node, EnvParams) and name in node.parts else getattr(node, name)
 
 
 def _fields(node: Any) -> dict[str, bool]:
@@ -152,5 +157,5 @@ def _draw(
 def _replace_part(node: Any, path: list[str], value: Any) -> Any:
     """A tree of dataclasses with one part exchanged."""
     if len(path) > 1:
-        value = _replace_part(getattr(node, path[0]), path[1:], value)
+        value = _replace_part(_entry(node, path[0]), path[1:], value)
     return node.replace(**{path[0]: value})

@@ -1,6 +1,7 @@
 """Params (what a task is) and state (what changes) of an environment: a few fields of its own, and those of its parts.
 
-`params.lidar`, `state.odometry`: what a part has is read by its name, like a field.
+`params.odometry`, `state.slip`: what the package's own parts and rules have is read by its name, with a type. What a
+part or a rule from outside has is an entry of `parts`.
 """
 
 from __future__ import annotations
@@ -8,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any, Generic, TypeVar, overload
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +19,16 @@ from jaxtyping import Array, Float, Int
 
 from subterra_jax.rows import vary_like
 from subterra_jax.tunnel import Tunnel
+
+if TYPE_CHECKING:  # they import this module themselves
+    from subterra_jax.parts.faults import FaultParams, FaultState
+    from subterra_jax.parts.imu import ImuParams, ImuState
+    from subterra_jax.parts.obstacles import ObstacleParams, ObstacleState
+    from subterra_jax.parts.odometer import OdometryParams, OdometryState
+    from subterra_jax.parts.slip import SlipParams, SlipState
+    from subterra_jax.parts.unicycle import VehicleParams
+    from subterra_jax.rules.rule import StartParams
+    from subterra_jax.rules.stop import GoalParams, ToldParams
 
 
 def as_array(value: Any, like: Any = None) -> Any:
@@ -75,17 +86,9 @@ def _like(old: Any, new: Any) -> Any:
 
 
 class _Named:
-    """Fields, and named parts in the field `parts` that are read like fields."""
+    """Fields, and entries of the field `parts`."""
 
     parts: Mapping[str, Any]
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__") or name == "parts":
-            raise AttributeError(name)
-        try:
-            return self.parts[name]
-        except KeyError:
-            raise AttributeError(f"{type(self).__name__} has no {name!r}; its parts are {sorted(self.parts)}") from None
 
     def replace(self, **updates: Any) -> Any:
         """Return a copy with other fields, or other parts of names that are there.
@@ -101,25 +104,75 @@ class _Named:
             raise ValueError(
                 f"no {sorted(unknown)} in {type(self).__name__}; there are {sorted(own | set(self.parts))}"
             )
-        updates = {name: _like(getattr(self, name), value) for name, value in updates.items()}
-        fields = {name: value for name, value in updates.items() if name in own}
-        parts = {name: value for name, value in updates.items() if name not in own}
+        fields = {name: _like(getattr(self, name), value) for name, value in updates.items() if name in own}
+        parts = {name: _like(self.parts[name], value) for name, value in updates.items() if name not in own}
         if parts:
             kind: Any = type(self.parts)
             fields["parts"] = kind({**fields.get("parts", self.parts), **parts})
         return dataclasses.replace(self, **fields)  # type: ignore[type-var]
 
 
+_T = TypeVar("_T")
+
+
+class _Entry(Generic[_T]):
+    """An entry of `parts` that is read as an attribute. Those of another task are no attributes."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    @overload
+    def __get__(self, instance: None, owner: type) -> _Entry[_T]: ...
+
+    @overload
+    def __get__(self, instance: _Named, owner: type) -> _T: ...
+
+    def __get__(self, instance: _Named | None, owner: type) -> _Entry[_T] | _T:
+        if instance is None:
+            return self
+        if self._name not in instance.parts:
+            raise AttributeError(f"{owner.__name__} has no {self._name!r}; its parts are {sorted(instance.parts)}")
+        return instance.parts[self._name]
+
+
+class _ParamsOfParts(_Named):
+    vehicle: _Entry[VehicleParams] = _Entry()
+    lidar: _Entry[Any] = _Entry()  # `LidarParams`, or `SpatialParams`
+    odometry: _Entry[OdometryParams] = _Entry()
+    start: _Entry[StartParams] = _Entry()
+    reward: _Entry[Any] = _Entry()  # the rule's
+    slip: _Entry[SlipParams] = _Entry()
+    obstacles: _Entry[ObstacleParams] = _Entry()
+    faults: _Entry[FaultParams] = _Entry()
+    imu: _Entry[ImuParams] = _Entry()
+    goal: _Entry[GoalParams] = _Entry()
+    told: _Entry[ToldParams] = _Entry()
+    goal_coverage: _Entry[Float[Array, ""]] = _Entry()
+    walk: _Entry[Any] = _Entry()  # the walking robot, its gait, and the surface that it sees: `b2.mission`
+    policy: _Entry[Any] = _Entry()
+    relief: _Entry[Any] = _Entry()
+
+
+class _StatesOfParts(_Named):
+    goal: _Entry[Any] = _Entry()  # the rule's
+    odometry: _Entry[OdometryState] = _Entry()
+    slip: _Entry[SlipState] = _Entry()
+    obstacles: _Entry[ObstacleState] = _Entry()
+    faults: _Entry[FaultState] = _Entry()
+    imu: _Entry[ImuState] = _Entry()
+    legs: _Entry[Any] = _Entry()  # of `b2.mission`
+
+
 @partial(jax.tree_util.register_dataclass, data_fields=["tunnel", "horizon", "parts"], meta_fields=["errand"])
 @dataclasses.dataclass(frozen=True)
-class EnvParams(_Named):
+class EnvParams(_ParamsOfParts):
     """Everything about a task that is data. Every leaf may be vmapped.
 
     Attributes:
         tunnel: Tunnel, or a stack of tunnels of which each episode draws one.
         horizon: Steps after which an episode is truncated.
-        parts: Params of the robot, of each part and of the rule, by name: `vehicle`, `lidar`, `odometry`, `start`,
-            `reward` and what the task adds. Frozen, so that a tree of axes can be hashed, as a static argument must.
+        parts: Params of the robot, of each part and of the rule, by name. Those of the package are attributes too.
+            Frozen, so that a tree of axes can be hashed, as a static argument must.
         errand: What an agent is asked to do: `cover`, `stop`, `return` or `report`. Static.
     """
 
@@ -135,7 +188,7 @@ class EnvParams(_Named):
     meta_fields=[],
 )
 @dataclasses.dataclass(frozen=True)
-class State(_Named):
+class State(_StatesOfParts):
     """State of one environment. It holds no key: randomness comes with each call.
 
     Attributes:

@@ -86,7 +86,6 @@ class TunnelEnv:
         return self.observe(state, noise, params), state, reward, terminated, truncated, info
 
     def draw_reset(self, key: PRNGKeyArray, batch: Batch, params: EnvParams) -> dict[str, Any]:
-        """Draw the random numbers of a batch of resets; see `Env`."""
         sources: dict[str, Any] = {part.name: part for part in (self.motion, *self.parts)} | {"rule": self.rule}
         streams = {name: source.random_streams() for name, source in sources.items()}
         numbers = [2, *(number for of_source in streams.values() for number in of_source)]
@@ -230,7 +229,6 @@ class TunnelEnv:
         return jnp.concatenate([jnp.atleast_1d(entry) for entry in entries.values()])
 
     def skips_unwanted(self, params: EnvParams) -> bool:
-        """Tell whether a batch of observations costs little for those that nobody wants."""
         return any(part.skips_unwanted(params) for part in self.parts)
 
     @property
@@ -239,7 +237,6 @@ class TunnelEnv:
         return REPORT if self.rule.reports else ESTIMATE if self.estimates else COMMAND
 
     def observation_size(self, params: EnvParams) -> int:
-        """Count the numbers of one observation."""
         return sum(jnp.size(low) for low, _ in self._space(params).values())
 
     def fields(self, params: EnvParams) -> dict[str, slice]:
@@ -247,7 +244,6 @@ class TunnelEnv:
         return _slices({name: jnp.size(low) for name, (low, _) in self._space(params).items()})
 
     def observation_space(self, params: EnvParams) -> Box:
-        """Return the bounds of an observation."""
         bounds = self._space(params).values()
         low, high = (np.concatenate([np.ravel(np.asarray(bound[side])) for bound in bounds]) for side in (0, 1))
         return Box(low.astype(np.float32), high.astype(np.float32))

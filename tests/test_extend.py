@@ -94,7 +94,7 @@ def test_its_params_are_randomised_like_those_of_the_package(desk):
     mixed, axes = st.randomize(jax.random.key(0), params, {"gyro.sigma": (0.1, 0.2)}, 8)
     obs, _ = st.AutoReset(env, params_axes=axes).reset(jax.random.key(1), mixed, 8)
     assert obs.shape == (8, 19)
-    assert float(mixed.gyro.sigma.min()) >= 0.1
+    assert float(mixed.parts["gyro"].sigma.min()) >= 0.1
 
 
 def test_gymnasium_makes_tasks_with_a_sensor_from_outside(desk):

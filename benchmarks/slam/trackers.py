@@ -6,6 +6,7 @@ rings, whether the walls have any or not. The particle filter is told the walls,
 beside the truth.
 """
 
+import dataclasses
 import itertools
 import time
 from collections.abc import Callable, Iterator
@@ -28,9 +29,8 @@ from scene.poses.trajectory import Trajectory, load_tum
 from scene.survey.cast import Caster
 from scene.survey.furniture import DESIGN
 from subterra_jax.baselines import cloud as particles
-from subterra_jax.baselines.reckoning import StepDistances
-from subterra_jax.baselines.rings import grid
-from subterra_jax.baselines.scanmodel import ScanModel, TunnelPose, fit_roughly
+from subterra_jax.baselines.rings import filter as rings
+from subterra_jax.baselines.scanmodel import ScanModel, TunnelPose, fit, fit_roughly
 from subterra_jax.baselines.wallmap import WallMap
 from subterra_jax.parts.wander import WanderParams
 
@@ -145,14 +145,13 @@ def _make(name: str, recording: Path) -> Tracker:
 
 def track_rings() -> Tracker:
     """Begins the ring filter of `subterra_jax.baselines`, without a pattern, on dry rail."""
-    track = grid.start((), N_BEAMS, wet=False)
+    track = rings.start(N_BEAMS, wet=False)
 
     def advance(step: Step) -> float:
         nonlocal track
-        distance, one = jnp.float32(step.distance), jnp.ones(())
-        moved, ranges = StepDistances(distance, distance), jnp.asarray(step.ranges, jnp.float32)
-        track = _count_rings(track, ranges, moved, one, jnp.float32(DESIGN.ring_width), jnp.zeros(()))
-        return float(track.station)
+        ranges, pitch = jnp.asarray(step.ranges, jnp.float32), jnp.float32(DESIGN.ring_width)
+        track = _count_rings(track, ranges, jnp.float32(step.distance), jnp.ones(()), pitch, jnp.zeros(()))
+        return float(track.estimate.station)
 
     return advance
 
@@ -175,7 +174,7 @@ def track_map(scene: Scene) -> Tracker:
     return advance
 
 
-_count_rings = jax.jit(grid.advance)
+_count_rings = jax.jit(rings.advance)
 _MOTION = particles.CloudParams(SCALE, WanderParams(SCALE_SIGMA, SCALE_PIECE))
 
 
@@ -192,8 +191,9 @@ def _move_cloud(key: Any, cloud: particles.Cloud, walls: WallMap, ranges: Any, d
     """Moves, weighs, summarises and resamples, as `ParticleLocaliser.update`; the scans come turned already."""
     move_key, draw_key = jax.random.split(jax.random.fold_in(key, 1))
     cloud = particles.move(move_key, cloud, walls, distance, jnp.zeros(()), _MOTION)
-    cloud = particles.weigh(cloud, walls, ranges, jnp.float32(_RANGE_MAX), ScanModel(), _MOTION)
-    station = particles.summarise(cloud, _MOTION).station
+    likely, pose = fit(walls, cloud.pose, ranges, jnp.float32(_RANGE_MAX), ScanModel())
+    cloud = particles.reweight(dataclasses.replace(cloud, pose=pose), likely, _MOTION)
+    station, _, _ = particles.summarise(cloud, _MOTION)
     return station, particles.resample(draw_key, cloud, _MOTION)
 
 

@@ -41,7 +41,8 @@ def spread_loop(env: st.TunnelEnv, params: st.EnvParams, n_envs: int) -> Loop:
         station = jax.random.uniform(station_key, (n_envs,), maxval=last)
 
         def one(key: PRNGKeyArray, station: Array) -> Carry:
-            return env.reset(key, params.replace(start=params.start.replace(station=station)))
+            start: Any = params.start
+            return env.reset(key, params.replace(start=start.replace(station=station)))
 
         return jax.vmap(one)(jax.random.split(reset_key, n_envs), station)
 

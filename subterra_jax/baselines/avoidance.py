@@ -12,7 +12,6 @@ from subterra_jax.baselines.agent import Observed
 from subterra_jax.baselines.steering import (
     CentreLine,
     Corridor,
-    Robot,
     Steering,
     find_walls,
     mirror_walls,
@@ -70,14 +69,12 @@ class Avoidance(Steering):
     offset_gain: float = 0.8
     angle_gain: float = 4.0
 
-    def begin(self, obs: Observed, params: Robot) -> Surroundings:
-        """Finds the walls; no hits yet."""
+    def begin(self, obs: Observed, params: EnvParams) -> Surroundings:
         nowhere = jnp.full((N_SCANS, obs.ranges.shape[0]), -1e3)
         walls = find_walls(obs.ranges, params)
         return Surroundings(walls, nowhere, nowhere, jnp.zeros((), jnp.int32), jnp.zeros(()))
 
-    def look(self, memory: Surroundings, obs: Observed, command: Float[Array, "2"], params: Robot) -> Surroundings:
-        """Tracks the walls, moves the hits along, adds those of this scan, and chooses a lane."""
+    def look(self, memory: Surroundings, obs: Observed, command: Float[Array, "2"], params: EnvParams) -> Surroundings:
         before = memory.corridor
         walls = track_walls(predict_walls(before, command, params), obs.ranges, params)
         ahead = command[0] * params.vehicle.period * jnp.cos(before.angle + 0.5 * command[1] * params.vehicle.period)
@@ -90,11 +87,9 @@ class Avoidance(Steering):
         return dataclasses.replace(now, lane=self._lane(now, params))
 
     def cosine(self, memory: Surroundings) -> Float[Array, ""]:
-        """Returns the cosine of the tracked angle."""
         return jnp.cos(memory.corridor.angle)
 
-    def steer(self, memory: Surroundings, speed: Float[Array, ""], params: Robot) -> Float[Array, "2"]:
-        """Steers into the lane, and slows down before a box."""
+    def steer(self, memory: Surroundings, speed: Float[Array, ""], params: EnvParams) -> Float[Array, "2"]:
         turn = self.heading(memory, params) - memory.corridor.angle
         room = self.room(memory, memory.corridor.angle, params)
         # Misaligned, it turns first; and it never stands, because standing for a second ends the episode.
@@ -102,7 +97,7 @@ class Avoidance(Steering):
         allowed = jnp.maximum(jnp.minimum(self.speed * aligned, 1.5 * (room - self.headway)), 0.1)
         return jnp.stack([jnp.minimum(speed, allowed), self.angle_gain * turn])
 
-    def heading(self, memory: Surroundings, params: Robot) -> Float[Array, ""]:
+    def heading(self, memory: Surroundings, params: EnvParams) -> Float[Array, ""]:
         """Returns the angle to the axis that leads into the lane, rad; steep where a box is near."""
         away = memory.lane - memory.corridor.offset
         plain = jnp.clip(self.offset_gain * away, -1.3, 1.3)
@@ -113,14 +108,13 @@ class Avoidance(Steering):
         return jnp.where(jnp.abs(away) > _IN_LANE, steeper[chosen], plain)
 
     def turn_round(self, memory: Surroundings) -> Surroundings:
-        """Swaps ahead and behind, left and right."""
         walls = memory.corridor
         mirrored = mirror_walls(walls)
         return dataclasses.replace(
             memory, corridor=mirrored, along=-memory.along, across=-memory.across, lane=-memory.lane
         )
 
-    def lanes(self, memory: Surroundings, params: Robot) -> tuple[Float[Array, "lanes"], Float[Array, "lanes"]]:
+    def lanes(self, memory: Surroundings, params: EnvParams) -> tuple[Float[Array, "lanes"], Float[Array, "lanes"]]:
         """Returns lanes from right to left, m left of the middle, and their free lengths, m, up to `look_ahead`."""
         walls = memory.corridor
         wide = params.vehicle.radius + self.margin
@@ -134,7 +128,7 @@ class Avoidance(Steering):
         inside = jnp.abs(across - lane[:, None]) < wide
         return lane, jnp.min(jnp.where(inside, along, self.look_ahead), axis=1)
 
-    def room(self, memory: Surroundings, angle: Float[Array, ""], params: Robot) -> Float[Array, ""]:
+    def room(self, memory: Surroundings, angle: Float[Array, ""], params: EnvParams) -> Float[Array, ""]:
         """Returns the distance to the first hit ahead at an angle to the axis (rad), m; 6 without hits."""
         cos, sin = jnp.cos(angle), jnp.sin(angle)
         across = memory.across - memory.corridor.offset
@@ -143,7 +137,7 @@ class Avoidance(Steering):
         in_way = (ahead > 0.0) & (jnp.abs(aside) < params.vehicle.radius + 0.05)
         return jnp.min(jnp.where(in_way, ahead, _SEEN))
 
-    def _lane(self, memory: Surroundings, params: Robot) -> Float[Array, ""]:
+    def _lane(self, memory: Surroundings, params: EnvParams) -> Float[Array, ""]:
         """Chooses the lane: long free, near, near the middle."""
         lane, free = self.lanes(memory, params)
         away = jnp.abs(lane - memory.corridor.offset)

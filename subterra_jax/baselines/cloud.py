@@ -9,7 +9,7 @@ from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from subterra_jax.baselines.reckoning import command_errors, odometer_errors, odometer_share
-from subterra_jax.baselines.scanmodel import ScanModel, TunnelPose, fit
+from subterra_jax.baselines.scanmodel import TunnelPose, move_pose
 from subterra_jax.baselines.stations import fault_sizes
 from subterra_jax.baselines.wallmap import WallMap
 from subterra_jax.parts.wander import WanderParams, advance_wander
@@ -121,7 +121,7 @@ class Cloud:
         scale: Lasting relative error of dead reckoning, 1.
         wander: Changing relative error, 1.
         wet: 1 where the particle assumes wet rail, else 0.
-        log_weight: Log of the weight; the weights sum to 1 after `weigh`.
+        log_weight: Log of the weight; the weights sum to 1 after `reweight`.
         odometer: Mean and variance of the odometer's relative error, given the particle's way; None where the odometer
             is not weighed apart.
     """
@@ -172,22 +172,9 @@ def move(
     wet = jnp.where(flips, 1.0 - cloud.wet, cloud.wet)
     grip = 1.0 - params.slip_loss * wet
     distance = travelled * (1.0 + cloud.scale + cloud.wander) * grip + params.step_sigma * normal[0]
-    after = move_pose(walls, cloud.pose, distance, turned)
+    after = move_pose(cloud.pose, distance, turned, walls.curvature(cloud.pose.station)[2])
     wander = jax.vmap(advance_wander, (0, None, 0, None))(cloud.wander, travelled, normal[1], params.wander)
     return dataclasses.replace(cloud, pose=after, wander=wander, wet=wet)
-
-
-def move_pose(walls: WallMap, pose: TunnelPose, distance: Float[Array, "*n"], turned: Float[Array, ""]) -> TunnelPose:
-    """Moves poses by a distance (m) each and a turn (rad; NaN is that of the axis), along the map's curvature."""
-    curvature = walls.curvature(pose.station)[2]
-    turned = jnp.where(jnp.isnan(turned), curvature * distance, turned)
-    middle = pose.heading + 0.5 * turned
-    along = distance * jnp.cos(middle) / (1.0 - curvature * pose.lateral)
-    return TunnelPose(
-        station=pose.station + along,
-        lateral=pose.lateral + distance * jnp.sin(middle),
-        heading=pose.heading + turned - curvature * along,
-    )
 
 
 def weigh_odometer(
@@ -224,20 +211,7 @@ def weigh_odometer(
     return dataclasses.replace(cloud, odometer=jnp.where(told, learnt, cloud.odometer)), likely
 
 
-def weigh(
-    cloud: Cloud,
-    walls: WallMap,
-    ranges: Float[Array, "n_beams"],
-    range_max: Float[Array, ""],
-    model: ScanModel,
-    params: CloudParams,
-) -> Cloud:
-    """Multiplies the weights by the likelihood of a scan, and adjusts offsets and headings to it."""
-    gain, pose = fit(walls, cloud.pose, ranges, range_max, model)
-    return log_weights(dataclasses.replace(cloud, pose=pose), gain, params)
-
-
-def log_weights(cloud: Cloud, gain: Float[Array, "n"], params: CloudParams) -> Cloud:
+def reweight(cloud: Cloud, gain: Float[Array, "n"], params: CloudParams) -> Cloud:
     """Multiplies the weights by a likelihood, flattened where it would leave too few particles; `gain` is its log."""
     options = _normalise(cloud.log_weight + jnp.asarray(_POWERS)[:, None] * gain)
     enough = _effective_size(options) >= params.least_share * gain.shape[0]
@@ -280,27 +254,13 @@ def resample(key: PRNGKeyArray, cloud: Cloud, params: CloudParams) -> Cloud:
     )
 
 
-@struct.dataclass
-class CloudSummary:
-    """Estimate by the heaviest cluster of a cloud.
+def summarise(cloud: Cloud, params: CloudParams) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+    """Finds the heaviest cluster of a cloud.
 
-    Attributes:
-        station: Mean station of the heaviest cluster, m.
-        sigma: Standard deviation of all particles about it, m.
-        share: Weight of that cluster.
-        lateral: Lateral offset of the cluster, m.
-        heading: The cluster's heading against the tangent of growing station, rad, in [-π, π].
+    Returns:
+        Its mean station (m), the standard deviation of all particles about it (m), and its heading against the tangent
+        of growing station (rad, in [-π, π]).
     """
-
-    station: Float[Array, ""]
-    sigma: Float[Array, ""]
-    share: Float[Array, ""]
-    lateral: Float[Array, ""]
-    heading: Float[Array, ""]
-
-
-def summarise(cloud: Cloud, params: CloudParams) -> CloudSummary:
-    """Finds the heaviest cluster of a cloud, and its means."""
     weight, station = jnp.exp(cloud.log_weight), cloud.pose.station
     # Clusters that face opposite ways lie apart, however near their stations are.
     cos, sin = jnp.cos(cloud.pose.heading), jnp.sin(cloud.pose.heading)
@@ -314,10 +274,5 @@ def summarise(cloud: Cloud, params: CloudParams) -> CloudSummary:
     share = jnp.maximum(mass[best], 1e-12)
     mean = lambda value: jnp.sum(inside * value) / share  # noqa: E731
     middle = mean(station)
-    return CloudSummary(
-        station=middle,
-        sigma=jnp.sqrt(jnp.sum(weight * (station - middle) ** 2)),
-        share=share,
-        lateral=mean(cloud.pose.lateral),
-        heading=jnp.arctan2(mean(sin), mean(cos)),
-    )
+    sigma = jnp.sqrt(jnp.sum(weight * (station - middle) ** 2))
+    return middle, sigma, jnp.arctan2(mean(sin), mean(cos))

@@ -40,7 +40,6 @@ class FusedCount(Localiser):
     """
 
     def begin(self, obs: Observed, params: EnvParams) -> Belief:
-        """Begins with the nominal errors of the task."""
         start, start_sigma = believed_start(obs, params)
         sigmas = jnp.zeros(5).at[_S].set(start_sigma)
         slip = slip_sizes(params)
@@ -54,7 +53,6 @@ class FusedCount(Localiser):
     def update(
         self, memory: Belief, obs: Observed, driven: Driven, params: EnvParams, known: Known
     ) -> tuple[Station, Belief]:
-        """Predicts by the command, and corrects by the odometer and the flag."""
         del known
         step = driven.speed * params.vehicle.period
         belief = _predict(memory, driven.direction * driven.cosine * step)

@@ -19,16 +19,14 @@ from jaxtyping import Array, Float
 from subterra_jax.baselines.agent import Known, Observed, range_sigma
 from subterra_jax.baselines.avoidance import steering_of
 from subterra_jax.baselines.bayes import diffuse, neighbours, normalised
-from subterra_jax.baselines.cloud import cloud_params, move_pose
+from subterra_jax.baselines.cloud import CloudParams, cloud_params
 from subterra_jax.baselines.exactscan import ExactParams, exact_likelihood
 from subterra_jax.baselines.navigator import Navigator
-from subterra_jax.baselines.particle import Relocaliser
 from subterra_jax.baselines.reckoning import Reckoning, begin_reckoning, odometer_share, reckon, unobserved_distance
-from subterra_jax.baselines.scanmodel import ScanModel, TunnelPose, fit, fit_roughly
+from subterra_jax.baselines.scanmodel import ScanModel, TunnelPose, fit, fit_roughly, move_pose
 from subterra_jax.baselines.stations import Driven, Localiser, Station, told_start
 from subterra_jax.baselines.steering import CentreLine
 from subterra_jax.baselines.wallmap import WallMap, wall_map
-from subterra_jax.parts.wander import WanderParams
 from subterra_jax.state import EnvParams
 
 NAME = "histogram-filter"
@@ -41,26 +39,9 @@ _OUTSIDE = -30.0  # log likelihood of a scan beyond a mouth
 _LEAST_SIGMA = 0.01  # m
 
 
-@struct.dataclass
-class Summary:
-    """Most likely place of a belief.
-
-    Attributes:
-        station: Mean station of the heaviest cluster, m.
-        sigma: Standard deviation of the whole belief about `station`, m, whatever the direction.
-        mass: Share of the belief in that cluster.
-        direction: 1 where it faces growing stations, else -1.
-    """
-
-    station: Float[Array, ""]
-    sigma: Float[Array, ""]
-    mass: Float[Array, ""]
-    direction: Float[Array, ""]
-
-
 def summarise(
     mass: Float[Array, "ways n"], station: Float[Array, "ways n"], reach: Float[Array, ""], cell: float
-) -> Summary:
+) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
     """Finds the heaviest cluster of a belief.
 
     Args:
@@ -68,6 +49,10 @@ def summarise(
         station: Stations of the cells, m.
         reach: Half the length of a cluster, m.
         cell: Length of a cell, m.
+
+    Returns:
+        Its mean station (m), the standard deviation of the whole belief about it (m), whatever the direction, and 1
+        where it faces growing stations, else -1.
     """
     near = _mass_within(mass, jnp.maximum(jnp.round(reach / cell), 1.0).astype(jnp.int32))
     # All cells about a narrow peak have it within reach; the small term picks the peak itself.
@@ -78,7 +63,7 @@ def summarise(
     share = jnp.maximum(jnp.sum(cluster), 1e-12)
     middle = jnp.sum(cluster * station) / share
     sigma = jnp.sqrt(jnp.sum(mass * (station - middle) ** 2))
-    return Summary(middle, sigma, share, 1.0 - 2.0 * way)
+    return middle, sigma, 1.0 - 2.0 * way
 
 
 def _mass_within(mass: Float[Array, "ways n"], reach: Array) -> Float[Array, "ways n"]:
@@ -87,21 +72,6 @@ def _mass_within(mass: Float[Array, "ways n"], reach: Array) -> Float[Array, "wa
     total = jnp.concatenate([jnp.zeros((mass.shape[0], 1)), jnp.cumsum(mass, axis=1)], axis=1)
     index = jnp.arange(n)
     return total[:, jnp.minimum(index + reach + 1, n)] - total[:, jnp.maximum(index - reach, 0)]
-
-
-@struct.dataclass
-class WayNoise:
-    """Errors of a dead-reckoned way.
-
-    Attributes:
-        scale_sigma: Standard deviation of the relative error that lasts an episode, 1.
-        wander: The relative error that changes along the way.
-        step_sigma: Standard deviation of the noise of one step, m.
-    """
-
-    scale_sigma: float
-    wander: WanderParams
-    step_sigma: float
 
 
 @struct.dataclass
@@ -140,7 +110,7 @@ class HistogramLocaliser(Localiser):
     """
 
     walls: WallMap
-    noise: WayNoise
+    noise: CloudParams
     scan: ScanModel
     odometer_share: float
     exact: ExactParams
@@ -150,11 +120,10 @@ class HistogramLocaliser(Localiser):
     @classmethod
     def of(cls, params: EnvParams, exact: ExactParams | None = None, cell: float = CELL) -> "HistogramLocaliser":
         """Makes a localiser for the map of a task, which may be a stack, and for its nominal errors; on the host."""
-        nominal = cloud_params(params)
         span = float(np.max(np.asarray(params.tunnel.length))) if params.errand == "report" else 2.0 * WINDOW
         return cls(
             walls=wall_map(params.tunnel),
-            noise=WayNoise(float(nominal.scale_sigma), nominal.wander, float(nominal.step_sigma)),
+            noise=cloud_params(params),
             scan=ScanModel(range_sigma=range_sigma(params)),
             odometer_share=odometer_share(params),
             exact=exact or ExactParams(),
@@ -163,24 +132,22 @@ class HistogramLocaliser(Localiser):
         )
 
     def begin(self, obs: Observed, params: EnvParams) -> HistogramMemory:
-        """Returns a belief about the told start, as wide as it is uncertain."""
-        start = told_start(obs, params)
-        origin = start - 0.5 * self.n_cells * self.cell
-        sigma = jnp.maximum(jnp.asarray(params.start.station_sigma, jnp.float32), 0.5 * self.cell)
-        log_mass = -0.5 * ((self._tape(origin) - start) / sigma) ** 2
-        return self._memory(log_mass[None], origin, obs, params)
-
-    def begin_anywhere(self, obs: Observed, params: EnvParams) -> HistogramMemory:
-        """Returns an even belief along the tunnel, facing either way."""
-        tape, margin = self._tape(jnp.zeros(())), jnp.asarray(params.goal.margin)
-        inside = (tape >= margin) & (tape <= params.tunnel.length - margin)
-        log_mass = jnp.where(inside, 0.0, _FLOOR)
-        return self._memory(jnp.stack([log_mass, log_mass]), jnp.zeros(()), obs, params)
+        """Returns a belief about the told start, as wide as it is uncertain; or an even one, facing either way."""
+        if params.errand == "report":
+            origin, margin = jnp.zeros(()), jnp.asarray(params.goal.margin)
+            tape = self._tape(origin)
+            inside = (tape >= margin) & (tape <= params.tunnel.length - margin)
+            log_mass = jnp.tile(jnp.where(inside, 0.0, _FLOOR), (2, 1))
+        else:
+            start = told_start(obs, params)
+            origin = start - 0.5 * self.n_cells * self.cell
+            sigma = jnp.maximum(jnp.asarray(params.start.station_sigma, jnp.float32), 0.5 * self.cell)
+            log_mass = -0.5 * ((self._tape(origin) - start) / sigma)[None] ** 2
+        return self._memory(log_mass, origin, obs, params)
 
     def update(
         self, memory: HistogramMemory, obs: Observed, driven: Driven, params: EnvParams, known: Known
     ) -> tuple[Station, HistogramMemory]:
-        """Advances by dead reckoning and a scan."""
         del known
         walls, period = self.walls.pick(params.tunnel), jnp.asarray(params.vehicle.period)
         range_max = jnp.asarray(params.lidar.range_max)
@@ -189,7 +156,8 @@ class HistogramLocaliser(Localiser):
         mass = self._slide(jnp.exp(memory.log_mass), along)
         way = memory.way + along
         now = dataclasses.replace(memory, way=way, reckoning=reckoning)
-        pose = move_pose(walls, self._poses(memory), distance, turn)
+        before = self._poses(memory)
+        pose = move_pose(before, distance, turn, walls.curvature(before.station)[2])
         _, pose = fit(walls, dataclasses.replace(pose, station=self._stations(now)), obs.ranges, range_max, self.scan)
         log_mass = jnp.log(mass) + self._score(walls, pose, obs, params)[:, None, :]
         log_mass = normalised(log_mass, _FLOOR)
@@ -259,10 +227,10 @@ class HistogramLocaliser(Localiser):
         """Returns the middle of the heaviest cluster, with what is driven and not yet observed."""
         mass = jnp.sum(jnp.exp(memory.log_mass), axis=1)
         reach = CLUSTER * jnp.asarray(params.goal.tolerance)
-        best = summarise(mass, self._stations(memory), reach, self.cell)
-        direction = best.direction * jnp.where(self._cosine(memory) > 0.0, 1.0, -1.0)
-        station = best.station + direction * unobserved_distance(reckoning, jnp.asarray(params.vehicle.period))
-        return Station(station, jnp.log(jnp.maximum(best.sigma, _LEAST_SIGMA)), direction)
+        station, sigma, facing = summarise(mass, self._stations(memory), reach, self.cell)
+        direction = facing * jnp.where(self._cosine(memory) > 0.0, 1.0, -1.0)
+        station = station + direction * unobserved_distance(reckoning, jnp.asarray(params.vehicle.period))
+        return Station(station, jnp.log(jnp.maximum(sigma, _LEAST_SIGMA)), direction)
 
 
 def _scales() -> np.ndarray:
@@ -270,9 +238,6 @@ def _scales() -> np.ndarray:
     return np.linspace(-MOST_SCALE, MOST_SCALE, N_SCALES, dtype=np.float32)
 
 
-def histogram_filter(params: EnvParams, exact: ExactParams | None = None) -> Navigator | Relocaliser:
+def histogram_filter(params: EnvParams, exact: ExactParams | None = None) -> Navigator:
     """Makes the filter with the steering and the mission of the other baselines."""
-    localiser = HistogramLocaliser.of(params, exact)
-    if params.errand == "report":
-        return Relocaliser(localiser, CentreLine(), name=NAME)
-    return Navigator(localiser, steering_of(params, CentreLine()), name=NAME, uses_map=True)
+    return Navigator(HistogramLocaliser.of(params, exact), steering_of(params, CentreLine()), name=NAME, uses_map=True)

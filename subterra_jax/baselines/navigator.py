@@ -1,6 +1,7 @@
 """An agent made of a localiser, a steering and a mission, and what the mission asks: cover, stop, return, report."""
 
 import dataclasses
+import math
 from typing import Any
 
 import jax
@@ -18,6 +19,8 @@ TURN_SPEED = 0.1  # m/s
 _TURN_RATE = 1.5  # rad/s
 _TURNED = 0.1  # rad; the steering corrects what is left of a turn
 _FAR = 1e6  # m
+_FURTHEST = 0.9  # of the distance in which to report: the rest covers the error of dead reckoning
+_MOUTH_BEAMS = (1, -1)  # the slanting beams ahead: without an echo on either side a mouth is some metres away
 
 
 @struct.dataclass
@@ -29,7 +32,9 @@ class Mission:
         flagged: True once the flag has been seen.
         to_turn: Angle still to turn, rad; 0 while it drives.
         heading: Last reading of the odometer's heading, rad.
-        stopped: True once it has arrived; it then stands.
+        stopped: True once it has arrived, or knows where it is; it then stands.
+        travelled: Distance commanded, m.
+        sure: Distance over which it has been sure of its place, m.
     """
 
     direction: Float[Array, ""]
@@ -37,12 +42,14 @@ class Mission:
     to_turn: Float[Array, ""]
     heading: Float[Array, ""]
     stopped: Bool[Array, ""]
+    travelled: Float[Array, ""]
+    sure: Float[Array, ""]
 
 
 def start_mission(obs: Observed) -> Mission:
     """Returns the mission at the start: on the way out."""
-    no = jnp.zeros((), bool)
-    return Mission(jnp.ones(()), no, jnp.zeros(()), obs.heading, no)
+    zero, no = jnp.zeros(()), jnp.zeros((), bool)
+    return Mission(jnp.ones(()), no, zero, obs.heading, no, zero, zero)
 
 
 def is_turning(mission: Mission) -> Bool[Array, ""]:
@@ -63,7 +70,7 @@ def target_speed(mission: Mission, estimate: Station, obs: Observed, params: Env
     if params.errand == "cover":
         return speed_max
     if params.errand == "report":
-        return jnp.zeros(())  # stand and report
+        return jnp.where(mission.stopped, 0.0, speed_max)
     target = obs.goal
     if params.errand == "return":
         home = told_start(obs, params)
@@ -75,10 +82,31 @@ def target_speed(mission: Mission, estimate: Station, obs: Observed, params: Env
 
 def check_arrival(mission: Mission, target: Float[Array, ""], driven: Float[Array, ""], params: EnvParams) -> Mission:
     """Returns the mission after a command: the target speed of the last period, driven in full, is the arrival."""
-    if params.errand == "cover":
+    if params.errand in ("cover", "report"):
         return mission
     there = (target < params.vehicle.speed_max) & (driven >= target) & ~is_turning(mission)
     return dataclasses.replace(mission, stopped=mission.stopped | there)
+
+
+def search(
+    mission: Mission, estimate: Station, moved: Float[Array, ""], obs: Observed, params: EnvParams, sure_for: float
+) -> Mission:
+    """Returns the mission of one that looks for its place: it stops once it has been sure for a while, or has to.
+
+    Args:
+        mission: Mission, with the distance up to this observation.
+        estimate: Estimate of the station; sure is one whose standard deviation is below half the task's tolerance.
+        moved: Distance commanded since the last observation, m.
+        obs: The observation.
+        params: The task.
+        sure_for: Distance over which the estimate must be sure, m.
+    """
+    is_sure = jnp.exp(estimate.log_sigma) < 0.5 * params.goal.tolerance
+    sure = jnp.where(is_sure, mission.sure + moved, 0.0)
+    mouth = jnp.all(obs.ranges[jnp.asarray(_MOUTH_BEAMS)] >= params.lidar.range_max)
+    must = (mission.travelled >= _FURTHEST * params.goal.travel_max) | mouth
+    stopped = mission.stopped | (sure >= sure_for) | must
+    return dataclasses.replace(mission, stopped=stopped, sure=sure)
 
 
 def watch(mission: Mission, obs: Observed, params: EnvParams) -> tuple[Mission, Bool[Array, ""], Bool[Array, ""]]:
@@ -129,21 +157,46 @@ class Memory:
     command: Float[Array, "2"]
 
 
+@dataclasses.dataclass(frozen=True)
+class Pace:
+    """Limits of the speed towards a goal: a slow robot has more scans of each metre.
+
+    Attributes:
+        cruise: Largest speed, m/s.
+        slow: Largest speed over the first distance, m/s.
+        learning: That first distance, m; 0 is none.
+    """
+
+    cruise: float = math.inf
+    slow: float = 0.0
+    learning: float = 0.0
+
+    def limit(self, target: Float[Array, ""], travelled: Float[Array, ""]) -> Float[Array, ""]:
+        """Return a target speed within the limits, m/s, after a distance commanded, m."""
+        return jnp.minimum(target, jnp.where(travelled < self.learning, self.slow, self.cruise))
+
+
 @struct.dataclass
 class Navigator:
     """An agent that localises itself, decides how far to go, and steers there.
+
+    Asked to report where it is, it drives until its map has told it; without a map it reports at once.
 
     Attributes:
         localiser: Estimates the station.
         steering: Keeps between the walls.
         name: Name on the board.
         uses_map: The localiser needs the map.
+        sure_for: Distance over which it must be sure of its place before it reports, m.
+        pace: Limits of its speed, where it has a goal.
     """
 
     localiser: Localiser
     steering: Steering
     name: str = struct.field(pytree_node=False, default="navigator")
     uses_map: bool = struct.field(pytree_node=False, default=False)
+    sure_for: float = struct.field(pytree_node=False, default=30.0)
+    pace: Pace = struct.field(pytree_node=False, default=Pace())
 
     @property
     def uses_lidar(self) -> bool:
@@ -156,7 +209,6 @@ class Navigator:
         return self.localiser.privileged
 
     def begin(self, key: PRNGKeyArray, obs: Observed, params: EnvParams) -> Memory:
-        """Begins at the believed start."""
         del key
         return Memory(
             steering=self.steering.begin(obs, params),
@@ -168,16 +220,21 @@ class Navigator:
     def act(
         self, key: PRNGKeyArray, memory: Memory, obs: Observed, params: EnvParams, known: Known
     ) -> tuple[Action, Memory]:
-        """Returns command and report of one control period, and the memory after it."""
         del key
         steering = self.steering.look(memory.steering, obs, memory.command, params)
         now, raised, done = watch(memory.mission, obs, params)
+        moved = memory.command[0] * params.vehicle.period
+        now = dataclasses.replace(now, travelled=now.travelled + moved)
         driven = Driven(memory.command[0], self.steering.cosine(steering), memory.mission.direction, raised, steering)
         mirrored = self.steering.turn_round(steering)
         steering = jax.tree.map(lambda new, old: jnp.where(done, new, old), mirrored, steering)
         estimate, localiser = self.localiser.update(memory.localiser, obs, driven, params, known)
+        if params.errand == "report":
+            sure_for = self.sure_for if self.uses_map else 0.0
+            now = search(now, estimate, moved, obs, params, sure_for)
         target = target_speed(now, estimate, obs, params)
-        command = self.steering.steer(steering, target, params)
+        paced = target if params.errand == "cover" else self.pace.limit(target, now.travelled)
+        command = self.steering.steer(steering, paced, params)
         command = jnp.where(is_turning(now), turn_command(now, params), command)
         limit = jnp.stack([jnp.asarray(params.vehicle.speed_max), jnp.asarray(params.vehicle.yaw_rate_max)])
         command = jnp.clip(command, jnp.stack([jnp.zeros(()), -limit[1]]), limit)

@@ -1,22 +1,21 @@
 """Dead reckoning: command and odometer fused by their nominal errors, with the delay of what is observed.
 
-An odometer that reads exactly what it read before, or where its noise goes on less than half of what was commanded, has
-stopped counting: then the command counts alone. One that has not moved since the robot set off shows how old the
-observations are.
+An odometer that reads less than half of what was commanded has stopped counting: then the command counts alone. One
+that has not moved since the robot set off shows how old the observations are.
 """
+
+import dataclasses
 
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from subterra_jax.baselines.agent import Observed
+from subterra_jax.baselines.agent import Known, Observed
 from subterra_jax.baselines.stations import slip_sizes
-from subterra_jax.parts.faults import MAX_DELAY
+from subterra_jax.parts.faults import MAX_DELAY, N_SEVERITIES
 from subterra_jax.parts.unicycle import wrap
 from subterra_jax.state import EnvParams
 
-# Weight of the odometer for ring counting; its errors and the command's are independent: 2 % + 1 % and 2 % + 2 %.
-ODOMETER_SHARE = 0.6
 _LEAST_COMMAND, _STILL_SHARE = 0.03, 0.5  # m, 1; half of a step is five standard deviations at full speed
 
 
@@ -64,11 +63,11 @@ def reckon(
         Distance (m), turn (rad; NaN where unknown), and dead reckoning after it.
     """
     moved, turned = obs.distance - before.distance, wrap(obs.heading - before.heading)
-    still = (moved == 0.0) & (turned == 0.0)
-    if obs.start is not None:
-        still = seems_still(moved, speed * period)
-    waiting = jnp.where(still, before.waiting, 0.0)
-    late = (waiting > 0.0) & (speed > 0.0)
+    still = seems_still(moved, speed * period)
+    late = (before.waiting > 0.0) & still
+    # One that was frozen from the start would never end the waiting.
+    waits = (still & (before.delay < MAX_DELAY)) | (speed <= 0.0)
+    waiting = jnp.where(waits, before.waiting, 0.0)
     delay = jnp.minimum(before.delay + late.astype(jnp.int32), MAX_DELAY)
     speeds = jnp.concatenate([speed[None], before.speeds[:-1]])
     share = jnp.where(still, 0.0, odometer_share)
@@ -77,8 +76,17 @@ def reckon(
     return distance, turn, Reckoning(obs.distance, obs.heading, speeds, delay, waiting)
 
 
-def seems_still(read: Float[Array, "*env"], commanded: Float[Array, "*env"]) -> Bool[Array, "*env"]:
-    """Tell whether an odometer seems to have stopped counting, where its noise goes on (tasks of version 1).
+def known_delay(before: Reckoning, params: EnvParams, known: Known) -> Reckoning:
+    """Return the dead reckoning with the delay that the episode has, where the truth is given and faults are drawn."""
+    if known is None or "fault_delay" not in known:
+        return before
+    share = known["severity"] / (N_SEVERITIES - 1)
+    delay = jnp.clip(jnp.round(params.faults.delay * known["fault_delay"] * share), 0, MAX_DELAY).astype(jnp.int32)
+    return dataclasses.replace(before, delay=delay, waiting=jnp.zeros_like(before.waiting))
+
+
+def seems_still(read: Float[Array, ""], commanded: Float[Array, ""]) -> Bool[Array, ""]:
+    """Tell whether an odometer seems to have stopped counting; its noise may go on.
 
     Args:
         read: Distance added in a step, m.
@@ -91,73 +99,6 @@ def unobserved_distance(now: Reckoning, period: Float[Array, ""]) -> Float[Array
     """Return the distance of the commands whose effect is not observed yet, m."""
     late = jnp.where(jnp.arange(MAX_DELAY + 1) < now.delay, now.speeds, 0.0)
     return period * jnp.sum(late)
-
-
-@struct.dataclass
-class StepDistances:
-    """Distances of one step, by command and by odometer.
-
-    Attributes:
-        commanded: Distance commanded, m.
-        read: Distance added by the odometer, m; exactly 0 from one that has stopped counting.
-    """
-
-    commanded: Float[Array, "*env"]
-    read: Float[Array, "*env"]
-
-    def __mul__(self, cosine: Float[Array, "*env"]) -> "StepDistances":
-        """Return the distances along an axis at an angle with this cosine."""
-        return StepDistances(self.commanded * cosine, self.read * cosine)
-
-
-@struct.dataclass
-class Delay:
-    """Delay of the observations of a batch of robots.
-
-    Attributes:
-        commands: Distances commanded in the last steps, newest first, m.
-        delay: Age of the observations, steps, as far as it showed when the robot set off.
-        waiting: 1 until the odometer first moves.
-    """
-
-    commands: Float[Array, "*env 5"]
-    delay: Float[Array, "*env"]
-    waiting: Float[Array, "*env"]
-
-
-def begin_delay(batch: tuple[int, ...]) -> Delay:
-    """Return the delay before anything was observed."""
-    return Delay(jnp.zeros((*batch, MAX_DELAY + 1)), jnp.zeros(batch), jnp.ones(batch))
-
-
-def advance_delay(before: Delay, moved: StepDistances) -> tuple[Float[Array, "*env"], Float[Array, "*env"], Delay]:
-    """Advances by one step.
-
-    Args:
-        before: Delay before the step.
-        moved: Distances of the step.
-
-    Returns:
-        Distance driven between this observation and the last one (m), distance driven since by commands whose effect
-        is not observed yet (m), and the delay after the step.
-    """
-    commands = jnp.concatenate([moved.commanded[..., None], before.commands[..., :-1]], axis=-1)
-    still = moved.read == 0.0
-    late = (before.waiting > 0.0) & still & (moved.commanded != 0.0)
-    # An odometer that was frozen from the start would never end the waiting.
-    frozen = late & (before.delay >= MAX_DELAY)
-    waiting = jnp.where(still & ~frozen, before.waiting, 0.0)
-    delay = jnp.minimum(before.delay + late, float(MAX_DELAY))
-    then = jnp.sum(jnp.where(jnp.arange(MAX_DELAY + 1) == delay[..., None], commands, 0.0), axis=-1)
-    driven = then + jnp.where(still, 0.0, ODOMETER_SHARE) * (moved.read - then)
-    now = Delay(commands, delay, waiting)
-    return jnp.where(waiting > 0.0, 0.0, driven), delayed_distance(now), now
-
-
-def delayed_distance(delay: Delay) -> Float[Array, "*env"]:
-    """Return the distance of the commands whose effect is not observed yet, m."""
-    late = jnp.arange(MAX_DELAY + 1) < delay.delay[..., None]
-    return jnp.sum(jnp.where(late, delay.commands, 0.0), axis=-1)
 
 
 def odometer_share(params: EnvParams) -> float:

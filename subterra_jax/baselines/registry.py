@@ -16,8 +16,8 @@ from subterra_jax.baselines.fused import FusedCount
 from subterra_jax.baselines.histogram import NAME as HISTOGRAM
 from subterra_jax.baselines.histogram import histogram_filter
 from subterra_jax.baselines.navigator import Navigator
-from subterra_jax.baselines.particle import particle_agent
-from subterra_jax.baselines.rings.grid import ring_filter
+from subterra_jax.baselines.particle import particle_filter
+from subterra_jax.baselines.rings.filter import ring_filter
 from subterra_jax.baselines.scanmatch import scan_matching
 from subterra_jax.baselines.stations import OdometerCount, Truth
 from subterra_jax.baselines.steering import CentreLine
@@ -41,14 +41,12 @@ class Random(Agent):
     name = "random"
 
     def begin(self, key: PRNGKeyArray, obs: Observed, params: EnvParams) -> Float[Array, ""]:
-        """Returns an empty memory."""
         del key, obs, params
         return jnp.zeros(())
 
     def act(
         self, key: PRNGKeyArray, memory: Float[Array, ""], obs: Observed, params: EnvParams, known: Known
     ) -> tuple[Action, Float[Array, ""]]:
-        """Draws a command within the limits."""
         del obs, known
         share = jax.random.uniform(key, (3,))
         speed = params.vehicle.speed_max * share[0]
@@ -99,6 +97,6 @@ _navigator("fused", FusedCount())
 register("ring-filter", ring_filter)
 _navigator("oracle", Truth())
 register("scan-matching", scan_matching)
-register("particle-filter", particle_agent)
+register("particle-filter", particle_filter)
 register(HISTOGRAM, histogram_filter)
 register(BAYES, ceiling)

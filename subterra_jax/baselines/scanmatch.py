@@ -17,6 +17,7 @@ from subterra_jax.baselines.avoidance import steering_of
 from subterra_jax.baselines.cloud import CloudParams, cloud_params
 from subterra_jax.baselines.navigator import Navigator
 from subterra_jax.baselines.reckoning import Reckoning, begin_reckoning, odometer_share, reckon, unobserved_distance
+from subterra_jax.baselines.scanmodel import TunnelPose, move_pose
 from subterra_jax.baselines.stations import Driven, Localiser, Station, told_start
 from subterra_jax.baselines.steering import CentreLine, find_walls
 from subterra_jax.lidar import bearings
@@ -75,20 +76,14 @@ class WallProfile:
 
 
 @struct.dataclass
-class AxisPose:
-    """Pose of the robot relative to the axis.
+class AxisPose(TunnelPose):
+    """Pose relative to an axis that is not known: what is known of it follows.
 
     Attributes:
-        station: Station, m.
-        lateral: Distance to the left of the axis, m.
-        heading: Heading against growing station, rad.
         bend: Curvature of the axis, 1/m.
         half_width: Usual distance of a wall, m.
     """
 
-    station: Float[Array, ""]
-    lateral: Float[Array, ""]
-    heading: Float[Array, ""]
     bend: Float[Array, ""]
     half_width: Float[Array, ""]
 
@@ -237,7 +232,7 @@ class MatchMemory:
     """Memory of the scan matcher.
 
     Attributes:
-        profile: Of a LiDAR in three dimensions it uses a whole level ring. The walls seen lately.
+        profile: The walls seen lately.
         pose: Estimated pose.
         scale: Relative error of dead reckoning, 1.
         covariance: Variance of the station against the profile (m²), covariance with the scale (m), variance of the
@@ -276,7 +271,6 @@ class ScanMatcher(Localiser):
 
     @classmethod
     def of(cls, params: EnvParams) -> "ScanMatcher":
-        """Makes a matcher for the nominal errors of a task."""
         return cls(cloud_params(params), MatchParams(range_sigma(params)), odometer_share(params))
 
     def begin(self, obs: Observed, params: EnvParams) -> MatchMemory:
@@ -284,12 +278,11 @@ class ScanMatcher(Localiser):
         zero, corridor = jnp.zeros(()), find_walls(obs.ranges, params)
         half_width = 0.5 * (corridor.left + corridor.right)
         pose = AxisPose(told_start(obs, params), corridor.offset, corridor.angle, zero, half_width)
-        lasting = self.motion.scale_sigma**2 + self.motion.wander.sigma**2
         return MatchMemory(
             profile=empty_profile(),
             pose=pose,
             scale=zero,
-            covariance=jnp.stack([zero, zero, zero + lasting]),
+            covariance=jnp.stack([zero, zero, _prior(self.motion)]),
             sigma=jnp.asarray(params.start.station_sigma, jnp.float32),
             cost=jnp.zeros(N_SHIFTS),
             travelled=zero,
@@ -299,11 +292,10 @@ class ScanMatcher(Localiser):
     def update(
         self, memory: MatchMemory, obs: Observed, driven: Driven, params: EnvParams, known: Known
     ) -> tuple[Station, MatchMemory]:
-        """Advances by dead reckoning, corrects by an informative match, and adds the scan to the profile."""
         del known
         period = jnp.asarray(params.vehicle.period)
         distance, turn, reckoning = reckon(memory.reckoning, obs, driven.speed, self.odometer_share, period)
-        pose = _move(memory.pose, distance * (1.0 + memory.scale), turn)
+        pose = move_pose(memory.pose, distance * (1.0 + memory.scale), turn, memory.pose.bend)
         covariance = _propagate(memory.covariance, distance, self.motion)
         ranges = level_ranges(obs, params)
         pose = centre(pose, ranges, self.params)
@@ -329,19 +321,6 @@ class ScanMatcher(Localiser):
 def scan_matching(params: EnvParams) -> Navigator:
     """Makes the matcher with the steering and the mission of the other baselines."""
     return Navigator(ScanMatcher.of(params), steering_of(params, CentreLine()), name="scan-matching")
-
-
-def _move(pose: AxisPose, distance: Float[Array, ""], turn: Float[Array, ""]) -> AxisPose:
-    """Moves a pose by a distance (m) and a turn (rad; NaN is replaced by that of the axis)."""
-    turn = jnp.where(jnp.isnan(turn), pose.bend * distance, turn)
-    middle = pose.heading + 0.5 * turn
-    along = distance * jnp.cos(middle)
-    return dataclasses.replace(
-        pose,
-        station=pose.station + along,
-        lateral=pose.lateral + distance * jnp.sin(middle),
-        heading=pose.heading + turn - pose.bend * along,
-    )
 
 
 def _propagate(covariance: Float[Array, "3"], distance: Float[Array, ""], motion: CloudParams) -> Float[Array, "3"]:

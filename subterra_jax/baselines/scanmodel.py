@@ -4,6 +4,7 @@
 """
 
 import dataclasses
+from typing import TypeVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -59,6 +60,31 @@ class TunnelPose:
     station: Float[Array, "*n"]
     lateral: Float[Array, "*n"]
     heading: Float[Array, "*n"]
+
+
+_Pose = TypeVar("_Pose", bound=TunnelPose)
+
+
+def move_pose(
+    pose: _Pose, distance: Float[Array, "*n"], turned: Float[Array, ""], curvature: Float[Array, "*n"]
+) -> _Pose:
+    """Move poses along an axis.
+
+    Args:
+        pose: The poses.
+        distance: Distance of each, m.
+        turned: Turn of all, rad; NaN is unknown, and replaced by that of the axis.
+        curvature: Curvature of the axis at each, 1/m.
+    """
+    turned = jnp.where(jnp.isnan(turned), curvature * distance, turned)
+    middle = pose.heading + 0.5 * turned
+    along = distance * jnp.cos(middle) / (1.0 - curvature * pose.lateral)
+    return dataclasses.replace(
+        pose,
+        station=pose.station + along,
+        lateral=pose.lateral + distance * jnp.sin(middle),
+        heading=pose.heading + turned - curvature * along,
+    )
 
 
 @struct.dataclass

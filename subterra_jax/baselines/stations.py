@@ -129,43 +129,25 @@ class Count:
     reading: Float[Array, ""]
 
 
-def _add_step(memory: Count, step: Float[Array, ""], driven: Driven, reading: Float[Array, ""]) -> Count:
-    """Adds the distance of a step, m."""
-    return Count(
-        station=memory.station + driven.direction * driven.cosine * step,
-        start_sigma=memory.start_sigma,
-        distance=memory.distance + jnp.abs(step),
-        steps=memory.steps + 1.0,
-        reading=reading,
-    )
-
-
-def _station(memory: Count, sigma: Float[Array, ""], driven: Driven) -> Station:
-    """Returns the estimate with the errors of start and counting."""
-    variance = jnp.maximum(sigma * sigma + memory.start_sigma * memory.start_sigma, _LEAST * _LEAST)
-    return Station(memory.station, 0.5 * jnp.log(variance), driven.direction)
-
-
-class _Summed(Localiser):
-    """A localiser that sums distances from the believed start."""
+@struct.dataclass
+class OdometerCount(Localiser):
+    """Sums the odometer's readings from the believed start."""
 
     def begin(self, obs: Observed, params: EnvParams) -> Count:
-        """Begins at the believed start."""
         zero = jnp.zeros(())
         return Count(*believed_start(obs, params), zero, zero, obs.distance)
-
-
-@struct.dataclass
-class OdometerCount(_Summed):
-    """Sums the odometer's readings."""
 
     def update(
         self, memory: Count, obs: Observed, driven: Driven, params: EnvParams, known: Known
     ) -> tuple[Station, Count]:
-        """Adds the odometer's step."""
         del known
-        memory = _add_step(memory, obs.distance - memory.reading, driven, obs.distance)
-        return _station(memory, odometry_sigma(memory.distance, memory.steps, params), driven), memory
+        step = obs.distance - memory.reading
+        station = memory.station + driven.direction * driven.cosine * step
+        distance, steps = memory.distance + jnp.abs(step), memory.steps + 1.0
+        sigma = odometry_sigma(distance, steps, params)
+        variance = jnp.maximum(sigma * sigma + memory.start_sigma * memory.start_sigma, _LEAST * _LEAST)
+        estimate = Station(station, 0.5 * jnp.log(variance), driven.direction)
+        return estimate, Count(station, memory.start_sigma, distance, steps, obs.distance)
 
 
 @struct.dataclass
@@ -175,14 +157,12 @@ class Truth(Localiser):
     privileged = True
 
     def begin(self, obs: Observed, params: EnvParams) -> Float[Array, ""]:
-        """Returns an empty memory."""
         del obs, params
         return jnp.zeros(())
 
     def update(
         self, memory: Float[Array, ""], obs: Observed, driven: Driven, params: EnvParams, known: Known
     ) -> tuple[Station, Float[Array, ""]]:
-        """Returns the truth, with the smallest standard deviation that an action can hold."""
         del obs, driven, params
         assert known is not None
         direction = jnp.where(known["heading_cos"] > 0.0, 1.0, -1.0)

@@ -1,6 +1,5 @@
-"""Finds the walls in a scan and steers along the middle between them, with a limit of speed."""
+"""Finds the walls in a scan and steers along the middle between them."""
 
-import dataclasses
 from typing import Any, Protocol
 
 import jax.numpy as jnp
@@ -9,26 +8,14 @@ from flax import struct
 from jaxtyping import Array, Bool, Float
 
 from subterra_jax.baselines.agent import Observed
-from subterra_jax.lidar import LidarParams, bearings
-from subterra_jax.parts.unicycle import VehicleParams, wrap
+from subterra_jax.lidar import bearings
+from subterra_jax.parts.unicycle import wrap
 from subterra_jax.state import EnvParams
 
 _SIDEWAYS = 0.65  # sine of a beam's bearing above which it meets a wall near by
 _GATE = 0.5  # m; a hit further than this from where the wall is expected is not the wall
 _TRUST, _TRUST_ANGLE = 0.5, 0.35  # weights of one scan
 _ECHO = 1e-3  # m below `range_max`: no echo
-
-
-class Robot(Protocol):
-    """The part of a task's params that finding walls and boxes needs."""
-
-    @property
-    def vehicle(self) -> VehicleParams:
-        """The vehicle."""
-
-    @property
-    def lidar(self) -> LidarParams:
-        """The LiDAR."""
 
 
 @struct.dataclass
@@ -51,7 +38,7 @@ class Corridor:
         return 0.5 * (self.right - self.left)
 
 
-def find_walls(ranges: Float[Array, "n_beams"], params: Robot) -> Corridor:
+def find_walls(ranges: Float[Array, "n_beams"], params: EnvParams) -> Corridor:
     """Finds the walls in the first scan: assumes a heading along the axis, then corrects it."""
     bearing = bearings(ranges.shape[0])
     side = np.abs(np.sin(bearing))
@@ -68,7 +55,7 @@ def find_walls(ranges: Float[Array, "n_beams"], params: Robot) -> Corridor:
     return corridor
 
 
-def predict_walls(corridor: Corridor, command: Float[Array, "2"], params: Robot) -> Corridor:
+def predict_walls(corridor: Corridor, command: Float[Array, "2"], params: EnvParams) -> Corridor:
     """Predicts the walls after a command, m/s and rad/s."""
     period = params.vehicle.period
     angle = corridor.angle + 0.5 * command[1] * period
@@ -81,7 +68,7 @@ def mirror_walls(corridor: Corridor) -> Corridor:
     return Corridor(corridor.right, corridor.left, wrap(corridor.angle - jnp.pi))
 
 
-def track_walls(corridor: Corridor, ranges: Float[Array, "n_beams"], params: Robot) -> Corridor:
+def track_walls(corridor: Corridor, ranges: Float[Array, "n_beams"], params: EnvParams) -> Corridor:
     """Corrects the walls by a scan; robust to beams without echo, to dust and to boxes at the wall."""
     bearing = jnp.asarray(bearings(ranges.shape[0]), jnp.float32) + corridor.angle
     along, across = ranges * jnp.cos(bearing), ranges * jnp.sin(bearing)
@@ -150,80 +137,17 @@ class CentreLine(Steering):
     angle_gain: float = 2.0
 
     def begin(self, obs: Observed, params: EnvParams) -> Corridor:
-        """Finds the walls in the first scan."""
         return find_walls(obs.ranges, params)
 
     def look(self, memory: Corridor, obs: Observed, command: Float[Array, "2"], params: EnvParams) -> Corridor:
-        """Tracks the walls."""
         return track_walls(predict_walls(memory, command, params), obs.ranges, params)
 
     def cosine(self, memory: Corridor) -> Float[Array, ""]:
-        """Returns the cosine of the tracked angle."""
         return jnp.cos(memory.angle)
 
     def steer(self, memory: Corridor, speed: Float[Array, ""], params: EnvParams) -> Float[Array, "2"]:
-        """Steers to the middle."""
         del params
         return jnp.stack([speed, -self.offset_gain * memory.offset - self.angle_gain * memory.angle])
 
     def turn_round(self, memory: Corridor) -> Corridor:
-        """Swaps left and right."""
         return mirror_walls(memory)
-
-
-@struct.dataclass
-class PaceMemory:
-    """Memory of `PacedSteering`.
-
-    Attributes:
-        steering: Memory of the steering.
-        driven: Distance commanded, m.
-    """
-
-    steering: Any
-    driven: Float[Array, ""]
-
-    @property
-    def corridor(self) -> Any:
-        """The walls, which a localiser asks for."""
-        return getattr(self.steering, "corridor", self.steering)
-
-
-@struct.dataclass
-class PacedSteering(Steering):
-    """A steering that drives no faster towards a goal than its robot can see: a slow one has more scans of each metre.
-
-    Attributes:
-        steering: The steering itself.
-        cruise: Largest speed, m/s.
-        slow: Largest speed over the first distance, m/s.
-        learning: That first distance, m; 0 is none.
-    """
-
-    steering: Steering
-    cruise: float
-    slow: float = 0.0
-    learning: float = 0.0
-
-    def begin(self, obs: Observed, params: EnvParams) -> PaceMemory:
-        """Returns the memory at the start."""
-        return PaceMemory(self.steering.begin(obs, params), jnp.zeros(()))
-
-    def look(self, memory: PaceMemory, obs: Observed, command: Float[Array, "2"], params: EnvParams) -> PaceMemory:
-        """Updates the memory of the steering by an observation."""
-        steering = self.steering.look(memory.steering, obs, command, params)
-        return PaceMemory(steering, memory.driven + command[0] * params.vehicle.period)
-
-    def cosine(self, memory: PaceMemory) -> Float[Array, ""]:
-        """Returns the cosine of the angle to the axis."""
-        return self.steering.cosine(memory.steering)
-
-    def steer(self, memory: PaceMemory, speed: Float[Array, ""], params: EnvParams) -> Float[Array, "2"]:
-        """Returns the command of the steering at the limited speed."""
-        if params.errand != "cover":
-            speed = jnp.minimum(speed, jnp.where(memory.driven < self.learning, self.slow, self.cruise))
-        return self.steering.steer(memory.steering, speed, params)
-
-    def turn_round(self, memory: PaceMemory) -> PaceMemory:
-        """Returns the memory after a turn by half a circle."""
-        return dataclasses.replace(memory, steering=self.steering.turn_round(memory.steering))

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from subterra_jax.state import EnvParams
 
-STRETCH = 1.0  # m over which a wandering error is taken to be constant
+STRETCH, FINE = 1.0, 0.5  # m over which a wandering error is taken to be constant: for a floor, beside scans
 FLAG_SIGMA = 0.06  # m; the flag is raised within one step of 0.2 m
 _GOALS = 60
 _DRAWS = 4000
@@ -63,11 +63,8 @@ def is_above(success: float, bound: float, n: int, n_bound: int = 0) -> bool:
 
 def way_out_variance(distance: Float[np.ndarray, " n"], params: EnvParams) -> Float[np.ndarray, " n"]:
     """Compute the variance of the distance driven after commands and readings of the way out, m²."""
-    found = [0.0]
-    errors = _Errors(params)
-    for _ in range(math.ceil(distance.max() / STRETCH)):
-        errors.drive(1.0)
-        found.append(errors.covariance[0, 0])
+    errors = _Errors(params, STRETCH)
+    found = [0.0, *(errors.drive(1.0) for _ in range(math.ceil(distance.max() / STRETCH)))]
     return np.interp(distance, STRETCH * np.arange(len(found)), found)
 
 
@@ -78,8 +75,7 @@ def way_back_variance(distance: Float[np.ndarray, " n"], params: EnvParams) -> F
     """
     found = []
     for goal in distance:
-        errors = _Errors(params)
-        errors.covariance[0, 0] += float(params.start.station_sigma) ** 2
+        errors = _Errors(params, STRETCH, float(params.start.station_sigma) ** 2)
         n = max(1, round(goal / STRETCH))
         for _ in range(n):
             errors.drive(1.0)
@@ -90,33 +86,85 @@ def way_back_variance(distance: Float[np.ndarray, " n"], params: EnvParams) -> F
     return np.array(found)
 
 
+def filter_variance(
+    station: Float[np.ndarray, " n"],
+    information: Float[np.ndarray, " n"] | Float[np.ndarray, "n blur"],
+    params: EnvParams,
+    blurs: tuple[float, ...] = (),
+) -> Float[np.ndarray, " n"]:
+    """Compute the variance of the station that a perfect filter keeps on the way through a tunnel at full speed, m².
+
+    It has commands, odometry and the information of each scan; to the first order in the errors.
+
+    Args:
+        station: Stations, m, growing.
+        information: Information of one scan about the station there, 1/m²; with `blurs` a column for each of them.
+        params: A task with slip; its start and its errors of commands and odometry.
+        blurs: Standard deviations of the station for which the columns hold, m, growing. Each scan then answers a
+            filter as uncertain as this one is at that place, within their range.
+
+    Returns:
+        Variances; behind the start, that of the start.
+
+    Source: Tichavský et al. 1998, the recursion of the posterior Cramér–Rao bound, here of a linear system.
+    """
+    begin, start = float(params.start.station), float(params.start.station_sigma) ** 2
+    at = begin + FINE * np.arange(max(1, math.ceil((station[-1] - begin) / FINE)) + 1)
+    scans = FINE / _full_step(params)
+    columns = information.reshape(len(station), -1).T
+    errors, found = _Errors(params, FINE, start), [start]
+    for row in scans * np.stack([np.interp(at[1:], station, column) for column in columns], axis=-1):
+        variance = errors.drive(1.0)
+        told = row[0] if not blurs else np.interp(0.5 * np.log(max(variance, 1e-12)), np.log(blurs), row)
+        if told > 0.0:
+            errors.learn(np.eye(6)[0], 1.0 / told)
+        found.append(errors.covariance[0, 0])
+    return np.interp(station, at, found)
+
+
+def _full_step(params: EnvParams) -> float:
+    """Return the length of a step at full speed, m."""
+    return float(np.max(params.vehicle.speed_max * params.vehicle.period))
+
+
 class _Errors:
     """Covariance of a Kalman filter, which needs no data.
 
     The state is the station (m), the lasting and the wandering slip, the lasting and the wandering scale error of the
     odometer, and what is added to that while facing falling stations.
+
+    Args:
+        params: The task.
+        stretch: Distance of one call of `drive`, m.
+        start: Variance of the station of the start, m².
     """
 
-    def __init__(self, params: EnvParams):
+    def __init__(self, params: EnvParams, stretch: float, start: float = 0.0):
+        self._stretch = stretch
         slip, odometry = params.slip, params.odometry
         lasting = (0.0, slip.gain_sigma, 0.0, odometry.distance_bias_sigma, 0.0, odometry.backward_bias_sigma or 0.0)
         wandering = (None, None, slip.wander, None, odometry.wander, None)
         self._stationary = np.array([0.0 if w is None else float(w.sigma) ** 2 for w in wandering])
-        self._keep = np.array([1.0 if w is None else math.exp(-STRETCH / float(w.length)) for w in wandering])
+        self._keep = np.array([1.0 if w is None else math.exp(-stretch / float(w.length)) for w in wandering])
         self.covariance = np.diag(np.square(np.asarray(lasting, float)) + self._stationary)
-        step = float(np.max(params.vehicle.speed_max * params.vehicle.period))
+        self.covariance[0, 0] += start
         # The readings' noise of a stretch, over its length: a variance of the scale.
-        self._noise = max(float(params.odometry.distance_sigma) ** 2 / (step * STRETCH), 1e-15)
+        self._noise = max(float(params.odometry.distance_sigma) ** 2 / (_full_step(params) * stretch), 1e-15)
 
-    def drive(self, direction: float) -> None:
-        """Drive a stretch, which the odometer measures: 1 for growing stations, -1 for falling ones."""
+    def drive(self, direction: float) -> float:
+        """Drive a stretch, which the odometer measures: 1 for growing stations, -1 for falling ones.
+
+        Returns:
+            Variance of the station afterwards, m².
+        """
         self.learn(np.array([0.0, 1.0, 1.0, 1.0, 1.0, float(direction < 0.0)]), self._noise)
         moved = np.eye(6)
-        moved[0, 1:3] = direction * STRETCH
+        moved[0, 1:3] = direction * self._stretch
         covariance = moved @ self.covariance @ moved.T
         self.covariance = covariance * np.outer(self._keep, self._keep) + np.diag(
             (1.0 - self._keep**2) * self._stationary
         )
+        return float(self.covariance[0, 0])
 
     def learn(self, row: Float[np.ndarray, "6"], noise: float) -> None:
         """Learn `row · state` with a variance of noise."""

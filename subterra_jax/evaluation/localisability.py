@@ -29,7 +29,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from subterra_jax import lidar, lidar3d
-from subterra_jax.evaluation.bounds import filter_variance
+from subterra_jax.evaluation.floor import filter_variance
 from subterra_jax.state import EnvParams
 from subterra_jax.tunnel import Tunnel, beside
 from subterra_jax.tunnel.plan import TunnelPlan

@@ -82,7 +82,6 @@ class Records:
         return len(self.seed)
 
     def where(self, chosen: Bool[np.ndarray, " n"]) -> "Records":
-        """Return the records of some episodes."""
         return Records(**{field.name: getattr(self, field.name)[chosen] for field in dataclasses.fields(self)})
 
     def as_columns(self) -> dict[str, list[Any]]:

@@ -193,7 +193,6 @@ class Faults(Part):
     streams: ClassVar[tuple[int, ...]] = (6, 7, 8, 9)
 
     def defaults(self) -> dict[str, Any]:
-        """Return `faults`."""
         return {"faults": FaultParams()}
 
     def draw_reset(self, key: Keys, batch: Batch, params: EnvParams) -> tuple[Array, ...]:
@@ -212,7 +211,6 @@ class Faults(Part):
         )
 
     def uniforms(self, params: EnvParams) -> int:
-        """Count the numbers of a step."""
         return n_step_noise(params.lidar.n_beams)
 
     def begin(self, draw: tuple[Array, ...], state: State, params: EnvParams) -> FaultState:
@@ -248,7 +246,6 @@ class Faults(Part):
         return Drive(jnp.where(frozen(own), 0.0, drive.wheels), motion)
 
     def advance(self, own: FaultState, step: Step, noise: Noise, params: EnvParams) -> FaultState:
-        """Remember the step, and let faults end or begin."""
         seen = sight(step.position, step.heading, step.place.station, step.after["odometry"])
         return advance_faults(own, seen, noise.uniform, params.lidar.n_beams, self.sizes(own, params))
 
@@ -262,7 +259,6 @@ class Faults(Part):
         return dataclasses.replace(sight, position=seen[:2], heading=seen[2], station=seen[3], parts=parts)
 
     def spoil(self, own: FaultState, ranges: Array, noise: Noise, params: EnvParams) -> Array:
-        """Apply dust and drop-outs."""
         return spoil(ranges, own, noise.uniform, jnp.asarray(params.lidar.range_max), self.sizes(own, params))
 
     def privileged(self, own: FaultState) -> dict[str, Array]:
@@ -270,7 +266,6 @@ class Faults(Part):
         return {"severity": own.severity, **{f"fault_{name}": own.scale[i] for i, name in enumerate(SIZES)}}
 
     def info(self, own: FaultState) -> dict[str, Array]:
-        """Return the severity."""
         return {"severity": own.severity}
 
     def with_beams(self, own: FaultState, share: float) -> FaultState:
@@ -280,9 +275,8 @@ class Faults(Part):
         )
 
     def levels(self, params: EnvParams) -> range:
-        """Return the severities."""
         return range(int(np.min(params.faults.severity_low)), int(np.max(params.faults.severity_high)) + 1)
 
     def at_level(self, params: EnvParams, level: Any) -> EnvParams:
-        """Return the params with one severity."""
-        return params.replace(faults=params.faults.replace(severity_low=level, severity_high=level))
+        one = dataclasses.replace(params.faults, severity_low=level, severity_high=level)
+        return params.replace(faults=one)

@@ -94,20 +94,16 @@ class Imu(Part):
     name: ClassVar[str] = "imu"
 
     def defaults(self) -> dict[str, Any]:
-        """Return `imu`."""
         return {"imu": ImuParams()}
 
     def draw_reset(self, key: Keys, batch: Batch, params: EnvParams) -> Float[Array, "*batch 6"]:
-        """Draw standard normal numbers for the biases."""
         del params
         return jax.random.normal(key, (*batch, 6), jnp.float32)
 
     def normals(self, params: EnvParams) -> int:
-        """Six for each sample, and six for the walk of the biases."""
         return 6 * (params.imu.samples + 1)
 
     def begin(self, draw: Float[Array, "6"], state: State, params: EnvParams) -> ImuState:
-        """Stand still."""
         axes = _axes(params.tunnel.pick(state.tunnel), state.station, state.heading)
         rest = measure(jnp.zeros((2, 3)), jnp.stack([axes, axes]), 1.0)
         bias = _sizes(params.imu.accel_bias, params.imu.gyro_bias) * draw
@@ -143,7 +139,6 @@ class Imu(Part):
         return {"imu": sight.parts[self.name].samples.reshape(-1)}
 
     def space(self, params: EnvParams) -> dict[str, Bounds]:
-        """Return no bounds."""
         n = 6 * params.imu.samples
         return {"imu": (np.full(n, -np.inf), np.full(n, np.inf))}
 

@@ -116,7 +116,6 @@ class Obstacles(Part):
     streams: ClassVar[tuple[int, ...]] = (6,)
 
     def defaults(self) -> dict[str, Any]:
-        """Return `obstacles`."""
         return {"obstacles": ObstacleParams()}
 
     def draw_reset(self, key: Keys, batch: Batch, params: EnvParams) -> UInt32[Array, "*batch 2"]:
@@ -125,25 +124,21 @@ class Obstacles(Part):
         return jax.random.bits(key, (*batch, 2), jnp.uint32)
 
     def begin(self, draw: UInt32[Array, "2"], state: State, params: EnvParams) -> ObstacleState:
-        """Return the seed, and where the boxes begin."""
         del params
         return ObstacleState(draw[0], state.station)
 
     def clearance(
         self, own: ObstacleState, position: Array, station: Array, tunnel: Tunnel, params: EnvParams
     ) -> Array:
-        """Measure the distance to the nearest box, m."""
         return clearance(own.seed, station, position, tunnel, _ahead(own, params))
 
     def hits(
         self, own: ObstacleState, sight: Sight, directions: Float[Array, "n_beams 2"], params: EnvParams
     ) -> Float[Array, "n_beams"]:
-        """Measure where beams meet boxes, m."""
         boxes = boxes_near(own.seed, sight.station, REACH, N_SLOTS, sight.tunnel, _ahead(own, params))
         return distance_along(boxes, sight.position, directions)
 
     def boxes(self, own: ObstacleState, station: Array, tunnel: Tunnel, params: EnvParams) -> list[Boxes]:
-        """Return the boxes within a LiDAR's reach."""
         return [boxes_near(own.seed, station, REACH, N_SLOTS, tunnel, _ahead(own, params))]
 
 

@@ -128,37 +128,30 @@ class Odometer(Part):
     streams: ClassVar[tuple[int, ...]] = (1,)
 
     def defaults(self) -> dict[str, Any]:
-        """Return `odometry`."""
         return {"odometry": OdometryParams()}
 
     def draw_reset(self, key: Keys, batch: Batch, params: EnvParams) -> Float[Array, "*batch n"]:
-        """Draw standard normal numbers."""
         return jax.random.normal(key, (*batch, params.odometry.n_reset_noise), jnp.float32)
 
     def normals(self, params: EnvParams) -> int:
-        """Two or three, as `OdometryParams` says."""
         return params.odometry.n_step_noise
 
     def begin(self, draw: Float[Array, "n"], state: State, params: EnvParams) -> OdometryState:
-        """Set the odometer to 0 and draw its errors."""
         del state
         return start_odometry(draw, params.odometry)
 
     def advance(self, own: OdometryState, step: Step, noise: Noise, params: EnvParams) -> OdometryState:
-        """Count the wheels' motion."""
         facing, along = step.before.heading, step.place.tangent
         backward = jnp.cos(facing) * along[0] + jnp.sin(facing) * along[1] < 0.0
         period = jnp.asarray(params.vehicle.period)
         return advance_odometry(own, step.drive.wheels, period, noise.normal, params.odometry, backward)
 
     def observe(self, own: OdometryState, sight: Sight, noise: Noise, params: EnvParams) -> dict[str, Array]:
-        """Return the readings as `odometry`."""
         del own, noise, params
         seen = sight.parts[self.name]
         return {"odometry": jnp.stack([seen.distance, seen.heading])}
 
     def space(self, params: EnvParams) -> dict[str, Bounds]:
-        """Return the bounds: a dead-reckoned distance has none."""
         del params
         return {"odometry": (np.array([-np.inf, -np.pi]), np.array([np.inf, np.pi]))}
 

@@ -20,15 +20,12 @@ class PlanarLidar(Part):
     place: ClassVar[int] = 0
 
     def defaults(self) -> dict[str, Any]:
-        """Return `lidar`."""
         return {"lidar": lidar.LidarParams()}
 
     def normals(self, params: EnvParams) -> int:
-        """One for each beam."""
         return params.lidar.n_beams
 
     def observe(self, own: Any, sight: Sight, noise: Noise, params: EnvParams) -> dict[str, Array]:
-        """Return noisy `ranges`, m."""
         ranges = self.true_ranges(own, sight, params)
         directions = lidar.beam_directions(sight.heading, params.lidar.n_beams)
         ranges = sight.spoil(jnp.minimum(ranges, sight.hits(directions)))
@@ -40,10 +37,8 @@ class PlanarLidar(Part):
         return lidar.scan(sight.tunnel, sight.position, sight.heading, sight.station, params.lidar, sight.wanted)
 
     def space(self, params: EnvParams) -> dict[str, Bounds]:
-        """Return bounds from 0 to the largest range."""
         n_beams, range_max = params.lidar.n_beams, jnp.max(jnp.asarray(params.lidar.range_max))
         return {"ranges": (np.zeros(n_beams), jnp.full(n_beams, range_max))}
 
     def skips_unwanted(self, params: EnvParams) -> bool:
-        """Tell whether the fused kernels cast the beams."""
         return lidar.skips_unwanted(params.lidar)

@@ -75,32 +75,26 @@ class Slip(Part):
     streams: ClassVar[tuple[int, ...]] = (3,)
 
     def defaults(self) -> dict[str, Any]:
-        """Return `slip`."""
         return {"slip": SlipParams()}
 
     def draw_reset(self, key: Keys, batch: Batch, params: EnvParams) -> Float[Array, "*batch 3"]:
-        """Draw standard normal numbers."""
         del params
         return jax.random.normal(key, (*batch, 3), jnp.float32)
 
     def normals(self, params: EnvParams) -> int:
-        """One, for the wandering error."""
         del params
         return 1
 
     def begin(self, draw: Float[Array, "3"], state: State, params: EnvParams) -> SlipState:
-        """Draw the slip of an episode."""
         del state
         return start_slip(draw, params.slip)
 
     def drive(self, own: SlipState, drive: Drive, state: State, params: EnvParams) -> Drive:
-        """Let wheels and robot slip alike."""
         del state, params
         wheels = true_motion(drive.wheels, own)
         return Drive(wheels, wheels)
 
     def advance(self, own: SlipState, step: Step, noise: Noise, params: EnvParams) -> SlipState:
-        """Let the wandering error go on."""
         return advance_slip(own, step.moved, noise.normal, params.slip)
 
     def privileged(self, own: SlipState) -> dict[str, Array]:

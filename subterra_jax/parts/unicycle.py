@@ -189,16 +189,13 @@ class Unicycle(Motion):
     name: ClassVar[str] = "vehicle"
 
     def defaults(self) -> dict[str, Any]:
-        """Return `vehicle`."""
         return {"vehicle": VehicleParams()}
 
     def obey(self, action: Float[Array, "n_action"], state: State, params: EnvParams) -> Float[Array, "2"]:
-        """Clip the action."""
         del state
         return clip_action(action[:2], params.vehicle)
 
     def move(self, state: State, drive: Drive, noise: Any, tunnel: Tunnel, params: EnvParams) -> Moved:
-        """Move along the arc of the true motion; see `Motion.move`."""
         del noise, tunnel
         position, heading = follow_arc(state.position, state.heading, drive.motion, jnp.asarray(params.vehicle.period))
         return Moved(position, heading, drive, (), jnp.inf, False, False, {})

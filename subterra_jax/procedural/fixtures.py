@@ -37,7 +37,6 @@ class Boxes:
     high: Float[np.ndarray, " k"]
 
     def where(self, chosen: Bool[np.ndarray, " k"]) -> Boxes:
-        """Return some of them."""
         return Boxes(**{field.name: getattr(self, field.name)[chosen] for field in dataclasses.fields(self)})
 
 

@@ -73,7 +73,6 @@ class Alignment:
         return turned[i] + self.curvature[i] * beyond + 0.5 * slope[i] * beyond * beyond
 
     def tangent(self, station: Float[np.ndarray, " m"]) -> Float[np.ndarray, "m 2"]:
-        """Return the unit tangent."""
         heading = self.heading(station)
         return np.stack([np.cos(heading), np.sin(heading)], axis=-1)
 

@@ -72,15 +72,7 @@ def figures() -> dict[str, Any]:
         "length": LENGTH,
         "splits": SPLITS,
         "held_out": HELD_OUT,
-        "line": {
-            "radius": LINE.radius,
-            "straight": LINE.straight,
-            "arc": LINE.arc,
-            "transition": LINE.transition,
-            "turn": LINE.turn,
-            "reverse_share": LINE.reverse_share,
-            "grid_step": LINE.grid_step,
-        },
+        "line": dataclasses.asdict(LINE),
         "grade": (GRADE_SD, GRADE_MOST, GRADE_WAVE),
         "share": _HALF,
     }

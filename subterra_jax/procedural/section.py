@@ -30,7 +30,6 @@ class Mount:
 
     @classmethod
     def draw(cls, rng: np.random.Generator) -> Mount:
-        """Draw a mount."""
         height, lateral = rng.uniform(*MOUNT_HEIGHT), rng.uniform(*MOUNT_LATERAL)
         roll, pitch = MOUNT_TILT * np.clip(rng.normal(size=2), -3.0, 3.0)
         return cls(float(height), float(lateral), float(roll), float(pitch))

@@ -56,7 +56,6 @@ class Waves:
         return cls(frequency, rng.uniform(0.0, 2.0 * np.pi, _TERMS), sd * np.sqrt(2.0 / _TERMS))
 
     def relief(self, grid: Grid, columns: Int[np.ndarray, " c"]) -> Float[np.ndarray, "n c"]:
-        """Return the surface, m."""
         n, step = len(grid.station), grid.station[1]
         # exp(i a (j + k)) = exp(i a j) exp(i a k): a few hundred sines a cosine instead of one a station.
         fine = np.exp(1j * step * np.outer(np.arange(_CHUNK), self.frequency[:, 0]))
@@ -178,7 +177,6 @@ class Patches:
 
     @classmethod
     def draw(cls, rng: np.random.Generator, ranges: PatchRanges, length: float, around: float) -> Patches:
-        """Draw the patches of a tunnel."""
         count = int(rng.poisson(length / rng.uniform(*ranges.spacing)))
         middle = np.column_stack([rng.uniform(0.0, length, count), rng.uniform(0.0, around, count)])
         half = 0.5 * rng.uniform(*ranges.size, (count, 2))

@@ -56,7 +56,6 @@ class Relocalise(GoalRule):
         return {"ring_pitch": (0.0, np.inf)}
 
     def observe(self, state: State, tunnel: Tunnel) -> dict[str, Array]:
-        """Return the number that `space` names."""
         del state
         return {"ring_pitch": tunnel.ring_pitch}
 
@@ -90,5 +89,4 @@ class Relocalise(GoalRule):
         return jnp.full((), jnp.nan, jnp.float32)
 
     def least_length(self, params: EnvParams) -> float:
-        """Return a metre and a margin at either end, m."""
         return float(1.0 + 2.0 * np.max(params.goal.margin))

@@ -111,7 +111,6 @@ class GoalRule(Rule):
     streams: ClassVar[tuple[int, ...]] = (0, 4, 5)
 
     def defaults(self) -> dict[str, Any]:
-        """Return `start`, `goal` and `reward`."""
         return {**super().defaults(), "goal": GoalParams(), "reward": GoalRewardParams()}
 
     def draw_reset(self, key: Keys, batch: Batch, params: EnvParams) -> tuple[Array, Array, Array]:
@@ -127,7 +126,6 @@ class GoalRule(Rule):
         return {"to_goal": state.goal.station - state.station, "still": state.goal.still}
 
     def tolerance(self, params: EnvParams) -> Any:
-        """Return the tolerance of the goal, m."""
         return params.goal.tolerance
 
 
@@ -144,7 +142,6 @@ class StopAt(GoalRule):
     chooses_goal: ClassVar[bool] = True
 
     def defaults(self) -> dict[str, Any]:
-        """Add `told`."""
         return {**super().defaults(), "told": ToldParams()}
 
     def start(self, draw: tuple[Array, Array, Array], tunnel: Tunnel, params: EnvParams) -> Start:
@@ -169,13 +166,11 @@ class StopAt(GoalRule):
         return {"goal": (0.0, np.inf), "ring_pitch": (0.0, np.inf), "start": (0.0, np.inf)}
 
     def observe(self, state: State, tunnel: Tunnel) -> dict[str, Array]:
-        """Return the numbers that `space` names."""
         del tunnel
         own = state.goal
         return {"goal": own.station, "ring_pitch": own.pitch, "start": own.told}
 
     def judge(self, step: Step, params: EnvParams) -> Verdict:
-        """Judge a stop by its distance from the goal."""
         goal = step.before.goal
         still, stopped = count_still(step, params.goal)
         error = step.place.station - goal.station
@@ -188,12 +183,10 @@ class StopAt(GoalRule):
         return Verdict(success, stopped, terms, after, {"goal_error": error, "stopped": stopped})
 
     def shortest_way(self, state: State, tunnel: Tunnel, params: EnvParams) -> Float[Array, ""]:
-        """Return the distance to the goal, m."""
         del tunnel, params
         return jnp.abs(state.goal.station - state.station)
 
     def least_length(self, params: EnvParams) -> float:
-        """Return the nearest goal and a margin at either end, m."""
         return float(np.max(params.goal.low) + 2.0 * np.max(params.goal.margin))
 
 

@@ -39,11 +39,9 @@ class Traverse(Rule):
     covers: ClassVar[bool] = True
 
     def defaults(self) -> dict[str, Any]:
-        """Return `start`, `reward` and `goal_coverage`, the share of the tunnel to cover."""
         return {**super().defaults(), "reward": RewardParams(), "goal_coverage": constants.GOAL_COVERAGE}
 
     def judge(self, step: Step, params: EnvParams) -> Verdict:
-        """Judge coverage."""
         coverage = jnp.clip(step.furthest / step.tunnel.length, 0.0, 1.0)
         success = (coverage >= params.goal_coverage) & ~step.contact
         terms = reward_terms(
@@ -59,7 +57,6 @@ class Traverse(Rule):
         return Verdict(success, success, terms)
 
     def shortest_way(self, state: State, tunnel: Tunnel, params: EnvParams) -> Float[Array, ""]:
-        """Return the way to the share that is asked for, m."""
         return params.goal_coverage * tunnel.length - state.station
 
 

@@ -33,7 +33,6 @@ class TurnBack(StopAt):
     errand: ClassVar[str] = "return"
 
     def start(self, draw: tuple[Array, Array, Array], tunnel: Tunnel, params: EnvParams) -> Start:
-        """Start as for `StopAt`, the flag down."""
         start = super().start(draw, tunnel, params)
         own = start.own
         goal = ReturnState(own.station, own.still, told=own.told, pitch=own.pitch, flag=jnp.zeros_like(own.told))
@@ -46,13 +45,11 @@ class TurnBack(StopAt):
         return {**entries, "flag": (0.0, 1.0), "start": start}
 
     def observe(self, state: State, tunnel: Tunnel) -> dict[str, Array]:
-        """Return the numbers that `space` names."""
         entries = super().observe(state, tunnel)
         start = entries.pop("start")
         return {**entries, "flag": state.goal.flag, "start": start}
 
     def judge(self, step: Step, params: EnvParams) -> Verdict:
-        """Judge the flag, then the stop."""
         goal = step.before.goal
         still, stopped = count_still(step, params.goal)
         station, back = step.place.station, jnp.abs(step.place.station - goal.told)
@@ -69,7 +66,6 @@ class TurnBack(StopAt):
         return Verdict(success, stopped, terms, after, info)
 
     def shortest_way(self, state: State, tunnel: Tunnel, params: EnvParams) -> Float[Array, ""]:
-        """Return the distance to the goal and back, m."""
         return 2.0 * super().shortest_way(state, tunnel, params)
 
 

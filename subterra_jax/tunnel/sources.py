@@ -10,10 +10,12 @@ from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
 
+import jax
 import numpy as np
 
 from subterra_jax.host.errors import TunnelError
 from subterra_jax.procedural import GENERATED, default_lining, expand, generate
+from subterra_jax.procedural.control import NAME as CONTROL
 from subterra_jax.procedural.open_world import in_benchmark
 from subterra_jax.tunnel.file import read_tunnel
 from subterra_jax.tunnel.kept import keep
@@ -100,22 +102,58 @@ def resolve(
         ValueError: A `Tunnel` was made for shorter ranges or for planar LiDARs alone, or the list is empty.
     """
     if isinstance(tunnel, Tunnel):
+        return _single(tunnel, lining, piece, reach, spatial)
+    sources = _listed(tunnel)
+    if not spatial and all(isinstance(each, str) and _is_ours(each) for each in sources):
+        return jax.device_put(_named(tuple(sources), lining, piece, reach))
+    return _joined(sources, lining, piece, reach, spatial)
+
+
+def _listed(tunnel: TunnelPlan | str | Path | Sequence[Source] | None) -> list[Source]:
+    """Return the tunnels that a user names, one by one."""
+    if tunnel is None:
+        return [PACKAGED[0]]
+    if isinstance(tunnel, str | Path):
+        return [*expand(str(tunnel))]
+    if isinstance(tunnel, TunnelPlan):
+        return [tunnel]
+    if not isinstance(tunnel, Iterable):
+        raise ValueError(f"a tunnel is a name, a file, a plan, a Tunnel or a list of these, got {tunnel!r}")
+    return list(tunnel)
+
+
+def _is_ours(name: str) -> bool:
+    """Tell whether a name always means the same tunnel."""
+    return name in PACKAGED or name == CONTROL or in_benchmark(name)
+
+
+@functools.lru_cache(maxsize=8)
+def _named(names: tuple[str, ...], lining: str | None, piece: tuple[float, float] | None, reach: float) -> Tunnel:
+    """Return tunnels by name, on the host: a process makes a task many times, and may give away what it got."""
+    return jax.device_get(_joined(names, lining, piece, reach, False))
+
+
+def _joined(
+    sources: Sequence[Source], lining: str | None, piece: tuple[float, float] | None, reach: float, spatial: bool
+) -> Tunnel:
+    """Return one tunnel, or the stack of several; arguments as for `resolve`."""
+    one = functools.partial(_single, lining=lining, piece=piece, reach=reach, spatial=spatial)
+    if not all(isinstance(each, str) and in_benchmark(each) for each in sources):
+        return stack([one(each) for each in sources])
+    with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:  # most of the work is NumPy's
+        return stack(list(pool.map(one, sources)))
+
+
+def _single(
+    tunnel: Source, lining: str | None, piece: tuple[float, float] | None, reach: float, spatial: bool
+) -> Tunnel:
+    """Return the device tunnel of one source; arguments as for `resolve`."""
+    if isinstance(tunnel, Tunnel):
         if tunnel.reach < reach:
             raise ValueError(f"the tunnel was made for ranges up to {tunnel.reach} m, got range_max={reach}")
         if spatial and tunnel.space is None:
             raise ValueError("the tunnel was made for planar LiDARs alone: give its name, its file or its plan")
         return tunnel
-    if isinstance(tunnel, str | Path) and len(names := expand(str(tunnel))) > 1:
-        tunnel = names
-    if tunnel is not None and not isinstance(tunnel, TunnelPlan | str | Path):
-        if not isinstance(tunnel, Iterable):
-            raise ValueError(f"a tunnel is a name, a file, a plan, a Tunnel or a list of these, got {tunnel!r}")
-        sources = list(tunnel)
-        one = functools.partial(resolve, lining=lining, piece=piece, reach=reach, spatial=spatial)
-        if not all(isinstance(each, str) and in_benchmark(each) for each in sources):
-            return stack([one(each) for each in sources])
-        with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:  # most of the work is NumPy's
-            return stack(list(pool.map(one, sources)))
     if isinstance(tunnel, TunnelPlan):
         return _put(tunnel, lining, piece, reach, spatial)
     if not GENERATED.fullmatch(str(tunnel)):

@@ -43,6 +43,16 @@ def leaves_equal(a, b, **tolerance):
         np.testing.assert_allclose(np.asarray(x), np.asarray(y), **tolerance)
 
 
+def test_an_entry_that_a_task_lacks_is_no_attribute_and_neither_is_a_misspelt_one():
+    env, params = st.make("Subterra/TraverseShort-v1")
+    state = jax.eval_shape(env.reset, jax.random.key(0), params)[1]
+    for tree in (params, state):
+        with pytest.raises(AttributeError, match="has no 'slip'; its parts are"):
+            _ = tree.slip
+        with pytest.raises(AttributeError, match="no attribute 'odometer'"):
+            _ = tree.odometer
+
+
 @pytest.mark.parametrize("estimates", [False, True])
 @pytest.mark.parametrize("id", sorted(id for id in st.TASKS))
 def test_every_task_gives_what_the_contract_says(id, estimates):

@@ -15,7 +15,6 @@ from subterra_jax.baselines.agent import Agent, observed, shown
 from subterra_jax.baselines.registry import AgentError, make_agent, register
 from subterra_jax.evaluation import Records, evaluate, listed_episodes
 from subterra_jax.evaluation import episodes as lists
-from subterra_jax.evaluation.bounds import stop_bounds
 from subterra_jax.evaluation.episodes import EvaluationError
 from subterra_jax.evaluation.records import area, interquartile_mean, interval, normalised, summarise
 from subterra_jax.evaluation.tally import add_estimate, crps, start_estimates
@@ -208,19 +207,3 @@ def test_records_survive_json_and_nothing_measured_is_no_number():
     assert found["contacts_per_100m"] == 0.5
     assert found["success_by_severity"] == {0: 1.0, 1: 0.0}
     assert found["success_area"] == 0.5
-
-
-def test_the_bounds_are_those_of_a_closed_form_where_there_is_one():
-    _, params = st.make("Subterra/StopAtShort-v1", tunnel="control")
-    still = dataclasses.replace(params.slip.wander, sigma=0.0)
-    steady = params.replace(
-        slip=dataclasses.replace(params.slip, wander=still),
-        odometry=dataclasses.replace(params.odometry, wander=still, distance_sigma=1e-6),
-        goal=dataclasses.replace(params.goal, low=40.0, high=40.0),
-    )
-    from math import erf, sqrt
-
-    # Two independent measurements of one scale, each good to 2 %, make 1.41 % together.
-    found = stop_bounds(steady)
-    for name, sigma in (("command", 0.8), ("odometry", 0.8), ("fused", 0.8 / sqrt(2.0))):
-        np.testing.assert_allclose(found[name], erf(0.25 / (sqrt(2.0) * sigma)), rtol=2e-3)

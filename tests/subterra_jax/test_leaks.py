@@ -8,12 +8,24 @@ import pytest
 import subterra_jax as st
 from subterra_jax.baselines.registry import make_agent, names
 from subterra_jax.evaluation import evaluate, listed_episodes
-from subterra_jax.evaluation.bounds import stop_bounds
+from subterra_jax.evaluation.floor import floor, within
 from tests.subterra_jax.panel import panel
 
 N = 200
 BLIND = ("random",)
 STOPPING = ("dead-reckoning", "fused", "oracle")
+
+
+def odometry_bound(params) -> float:
+    """Success of a stop by the odometer alone, in closed form: bias, wandering error and noise of each step."""
+    goal, odometry = params.goal, params.odometry
+    furthest = min(float(goal.high), float(params.tunnel.length) - 2.0 * float(goal.margin))
+    distance = np.linspace(float(goal.low), furthest, 200)
+    sigma, length = float(odometry.wander.sigma), float(odometry.wander.length)
+    wandered = 2.0 * sigma**2 * length * (distance + length * np.expm1(-distance / length))
+    noise = float(odometry.distance_sigma) ** 2 / float(params.vehicle.speed_max * params.vehicle.period) * distance
+    variance = (float(odometry.distance_bias_sigma) * distance) ** 2 + wandered + noise
+    return within(float(goal.tolerance), np.sqrt(variance))
 
 
 def three_errors(bound: float, n: int = N) -> float:
@@ -31,7 +43,7 @@ def control():
     def success(name, **spoilt):
         return evaluate(env, params, panel(agents, (STOPPING + BLIND).index(name), **spoilt), episodes).success.mean()
 
-    return success, stop_bounds(params)
+    return success, {"odometry": odometry_bound(params), "fused": floor(params)}
 
 
 @pytest.mark.slow
@@ -89,7 +101,7 @@ def test_every_episode_of_one_environment_has_biases_of_its_own():
 @pytest.mark.parametrize("name", sorted(set(names()) - {"oracle"}))
 def test_on_the_control_tunnel_nobody_beats_fused_dead_reckoning_by_three_points(name):
     env, params = st.make("Subterra/StopAt-v1", tunnel="control", lining="smooth")
-    bound = stop_bounds(params)["fused"]
+    bound = floor(params)
     agent = make_agent(name, params)
     success = evaluate(env, params, agent, listed_episodes(env, params)).success.mean()
     print(f"{name}: {100 * success:.1f} %, bound {100 * bound:.1f} %")
@@ -98,10 +110,10 @@ def test_on_the_control_tunnel_nobody_beats_fused_dead_reckoning_by_three_points
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "bound"), [("dead-reckoning", "odometry"), ("fused", "fused")])
+@pytest.mark.parametrize(("name", "bound"), [("dead-reckoning", odometry_bound), ("fused", floor)])
 def test_over_the_whole_list_dead_reckoning_lands_at_its_bounds(name, bound):
     env, params = st.make("Subterra/StopAt-v1", tunnel="subterra-351")
-    expected = stop_bounds(params)[bound]
+    expected = bound(params)
     success = evaluate(env, params, make_agent(name, params), listed_episodes(env, params)).success.mean()
     print(f"{name}: {100 * success:.1f} %, bound {100 * expected:.1f} %")
     assert abs(success - expected) < three_errors(expected, 500)

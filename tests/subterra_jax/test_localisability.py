@@ -8,7 +8,7 @@ import pytest
 
 import subterra_jax as st
 from benchmarks.rays import planar as reference
-from subterra_jax.evaluation import bounds
+from subterra_jax.evaluation import floor
 from subterra_jax.evaluation.localisability import Solid, localisability, marginal_bound, scan_information
 from subterra_jax.lidar import scan
 from subterra_jax.lidar3d import Relief, beams
@@ -133,14 +133,14 @@ def test_information_falls_with_the_square_of_the_noise(params, found):
 
 def test_a_filter_without_scans_keeps_the_drift_of_the_closed_form_and_scans_pull_it_in(params):
     station = np.arange(2.0, 79.0)
-    blind = bounds.filter_variance(station, np.zeros(len(station)), params[True])
-    np.testing.assert_allclose(blind, bounds._fused_variance(station, params[True]), rtol=1e-6)
+    blind = floor.filter_variance(station, np.zeros(len(station)), params[True])
+    np.testing.assert_allclose(blind, floor.way_out_variance(station, params[True]), rtol=0.02)
     # One scan of 10 cm a step, and nearly nothing else to go by: sigma² / n.
-    steps = [bounds.filter_variance(station, np.full(len(station), told), params[True]) for told in (1.0, 100.0)]
+    steps = [floor.filter_variance(station, np.full(len(station), told), params[True]) for told in (1.0, 100.0)]
     assert np.all(steps[1][5:] < steps[0][5:])
     assert np.all(steps[0][5:] < blind[5:])
     hidden = params[True].replace(start=params[True].start.replace(station_sigma=3.0))
-    first = bounds.filter_variance(np.array([0.0, 0.5, 60.0]), np.full(3, 1.0), hidden)
+    first = floor.filter_variance(np.array([0.0, 0.5, 60.0]), np.full(3, 1.0), hidden)
     # 2.5 scans of 1 m in the first half metre against a prior of 3 m.
     assert first[0] == pytest.approx(9.0)
     assert first[1] == pytest.approx(1.0 / (1.0 / 9.0 + 2.5), rel=0.01)
@@ -189,23 +189,23 @@ def test_a_scan_tells_a_filter_that_knows_less_what_its_own_spread_leaves_of_an_
     told = np.tile([400.0, 0.0], (len(station), 1))
     wide = params[True].replace(start=params[True].start.replace(station_sigma=3.0))
     for at, of in ((params[True], True), (wide, False)):
-        found = bounds.filter_variance(station, told, at, (0.05, 0.4))
-        sharp, blind = (bounds.filter_variance(station, column, at) for column in told.T)
+        found = floor.filter_variance(station, told, at, (0.05, 0.4))
+        sharp, blind = (floor.filter_variance(station, column, at) for column in told.T)
         assert (found[-1] < 0.5 * blind[-1]) == of, "whoever begins lost stays lost"
         assert np.all(found >= sharp - 1e-12)
-    between = bounds.filter_variance(np.array([0.0, 0.5, 1.0]), np.tile([8.0, 4.0], (3, 1)), wide, (1.5, 6.0))
-    first = bounds.filter_variance(np.array([0.0, 0.5, 1.0]), np.full(3, 6.0), wide)
+    between = floor.filter_variance(np.array([0.0, 0.5, 1.0]), np.tile([8.0, 4.0], (3, 1)), wide, (1.5, 6.0))
+    first = floor.filter_variance(np.array([0.0, 0.5, 1.0]), np.full(3, 6.0), wide)
     assert between[1] == pytest.approx(first[1], rel=1e-3), "half way in the log between two blurs"
 
 
 def test_the_drift_of_a_perfect_filter_takes_each_scan_as_blurred_as_the_filter_is(params, found):
     # Alone in a smooth corridor with edges that stand far apart, it may not read them as if it knew where it was.
     one = found[True]
-    sharp = np.sqrt(bounds.filter_variance(one.station, one.station_bound**-2.0, params[True]))
+    sharp = np.sqrt(floor.filter_variance(one.station, one.station_bound**-2.0, params[True]))
     assert np.all(one.drift >= sharp - 1e-9)
     hidden = params[True].replace(start=params[True].start.replace(station_sigma=3.0))
     lost = localisability(hidden)
-    naive = np.sqrt(bounds.filter_variance(lost.station, lost.station_bound**-2.0, hidden))
+    naive = np.sqrt(floor.filter_variance(lost.station, lost.station_bound**-2.0, hidden))
     at = np.searchsorted(lost.station, 33.0)
     assert lost.drift[at] > naive[at]
 

@@ -59,8 +59,14 @@ def test_command_and_odometer_share_a_step():
 
 
 def test_a_frozen_odometer_leaves_the_command_alone():
-    distances, _ = reckon([0.0, 0.2, 0.2, 0.2], [0.0, 2.0, 2.0, 1.0])
-    np.testing.assert_allclose(distances, [0.0, 0.2, 0.2, 0.1], atol=1e-6)
+    distances, _ = reckon([0.0, 0.2, 0.2, 0.22, 0.21], [0.0, 2.0, 2.0, 1.0, 1.0])
+    np.testing.assert_allclose(distances, [0.0, 0.2, 0.2, 0.1, 0.1], atol=1e-6)
+
+
+def test_an_odometer_that_is_frozen_from_the_start_is_not_waited_for():
+    distances, memory = reckon([0.0] * 8, [0.0] + [2.0] * 7)
+    np.testing.assert_allclose(distances, [0.0] * 5 + [0.2] * 3, atol=1e-6)
+    assert sum(distances) + float(reckoning.unobserved_distance(memory, PERIOD)) == pytest.approx(7 * 0.2)
 
 
 def test_the_age_of_what_is_observed_shows_when_the_robot_sets_off():
@@ -94,7 +100,7 @@ def test_a_cloud_that_faces_back_drives_to_smaller_stations(plan_of):
     cloud = cloud_at([40.0], heading=np.pi)
     after = move(jax.random.key(1), cloud, wall_map(straight).pick(straight), jnp.float32(2.0), jnp.float32(0.0), EXACT)
     assert float(after.pose.station[0]) == pytest.approx(38.0, abs=1e-3)
-    assert float(jnp.cos(summarise(after, EXACT).heading)) == pytest.approx(-1.0, abs=1e-3)
+    assert float(jnp.cos(summarise(after, EXACT)[2])) == pytest.approx(-1.0, abs=1e-3)
 
 
 def test_resampling_draws_each_particle_as_often_as_its_weight_says():
@@ -117,17 +123,16 @@ def test_a_cloud_with_enough_particles_is_not_resampled():
 
 def test_a_cloud_speaks_for_its_heaviest_cluster_and_admits_the_other():
     stations = np.concatenate([np.full(60, 10.0), np.full(40, 13.0)])
-    said = summarise(cloud_at(stations), EXACT)
-    assert float(said.station) == pytest.approx(10.0)
-    assert float(said.share) == pytest.approx(0.6, abs=1e-3)
-    assert float(said.sigma) == pytest.approx(np.sqrt(0.4) * 3.0, rel=1e-3)
+    station, sigma, _ = summarise(cloud_at(stations), EXACT)
+    assert float(station) == pytest.approx(10.0)
+    assert float(sigma) == pytest.approx(np.sqrt(0.4) * 3.0, rel=1e-3)
 
 
 @pytest.fixture(scope="module")
 def pockets():
     """The short stop between pockets, cut to 400 steps, and the filter's records of a few episodes."""
     env, params = st.make("Subterra/StopAtShort-v1", tunnel="subterra-351", horizon=400)
-    episodes = listed_episodes(env, params, 12)
+    episodes = listed_episodes(env, params, 10)
     return env, params, episodes, evaluate(env, params, particle_filter(params, 128), episodes)
 
 
@@ -141,12 +146,6 @@ def test_the_filter_stops_at_the_goal_where_dead_reckoning_does_not(pockets):
 
 def test_the_filter_knows_how_well_it_knows(pockets):
     assert 0.3 < np.median(pockets[3].nees) < 3.0
-
-
-def test_the_filter_is_deterministic(pockets):
-    env, params, episodes, filtered = pockets
-    again = evaluate(env, params, particle_filter(params, 128), episodes)
-    assert again.as_columns() == filtered.as_columns()
 
 
 @pytest.mark.slow
@@ -199,7 +198,7 @@ def test_the_ceiling_takes_likelihoods_whole_about_a_start_and_drives_as_far_as_
     assert motion.least_share < 0.1
     _, params = st.make("Subterra/Relocalise-v1", tunnel="control")
     made = ceiling(params)
-    assert made.filter.n_cells * made.filter.cell >= float(params.tunnel.length)
+    assert made.localiser.n_cells * made.localiser.cell >= float(params.tunnel.length)
     assert made.sure_for == float("inf")
 
 

@@ -129,31 +129,45 @@ def test_the_tunnels_of_a_split_are_of_all_its_kinds_alike(split):
     assert float(params.tunnel.pick(7).length) == float(own.length)
 
 
+def afresh(name="open:cast:val:5", length=60.0) -> st.Tunnel:
+    """A tunnel as another process has it."""
+    sources._named.cache_clear()
+    return resolve(name, None, (0.0, length), 30.0)
+
+
 def test_a_tunnel_is_made_once_and_then_read(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     made = []
     monkeypatch.setattr(sources, "generate", lambda *args, real=sources.generate: made.append(args) or real(*args))
-    first, again = (resolve("open:cast:val:5", None, (0.0, 60.0), 30.0) for _ in range(2))
+    first, again = afresh(), afresh()
     assert len(made) == 1
     assert jax.tree.structure(first) == jax.tree.structure(again)
     for one, other in zip(jax.tree.leaves(first), jax.tree.leaves(again), strict=True):
         np.testing.assert_array_equal(one, other)
         assert isinstance(other, jax.Array)
-    resolve("open:cast:val:5", None, (0.0, 61.0), 30.0)  # another piece is another tunnel
+    afresh(length=61.0)  # another piece is another tunnel
     monkeypatch.setattr(kept, "_code", lambda: "other code")
-    resolve("open:cast:val:5", None, (0.0, 60.0), 30.0)
+    afresh()
     assert len(made) == 3
+
+
+def test_what_a_process_has_made_it_has_again_even_if_the_first_was_given_away(monkeypatch):
+    first = afresh()
+    length = float(first.length)
+    monkeypatch.setattr(sources, "keep", None)
+    jax.tree.map(lambda leaf: leaf.delete(), first)
+    assert float(resolve("open:cast:val:5", None, (0.0, 60.0), 30.0).length) == length
 
 
 def test_the_cache_does_without_a_folder_survives_damage_and_does_not_grow_for_ever(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
     (tmp_path / "file").write_text("in the way")
-    assert resolve("open:cast:val:5", None, (0.0, 60.0), 30.0).count == 1
+    assert afresh().count == 1
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    resolve("open:cast:val:5", None, (0.0, 60.0), 30.0)
+    afresh()
     (file,) = (tmp_path / "subterra" / "tunnels").glob("*.pickle")
     file.write_bytes(file.read_bytes()[:100])
-    assert resolve("open:cast:val:5", None, (0.0, 60.0), 30.0).count == 1
+    assert afresh().count == 1
     monkeypatch.setattr(kept, "MOST", file.stat().st_size + 10)
-    resolve("open:cast:val:6", None, (0.0, 60.0), 30.0)
+    afresh("open:cast:val:6")
     assert len(list(file.parent.glob("*.pickle"))) == 1

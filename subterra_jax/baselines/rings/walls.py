@@ -43,11 +43,19 @@ class Walls:
         usual: Average distance of each side beam's end beyond the walls, m.
     """
 
-    distance: Float[Array, "*env 2"]
-    slope: Float[Array, "*env"]
-    bend: Float[Array, "*env"]
-    scans: Float[Array, "*env"]
-    usual: Float[Array, "*env 2 side"]
+    distance: Float[Array, "2"]
+    slope: Float[Array, ""]
+    bend: Float[Array, ""]
+    scans: Float[Array, ""]
+    usual: Float[Array, "2 side"]
+
+    def at(self, along: Float[Array, "2 side"]) -> Float[Array, "2 side"]:
+        """Return the distance of each wall at distances ahead, m."""
+        return self.distance[:, None] + _SIGN * (self.slope + 0.5 * self.bend * along) * along
+
+
+# Turned left, the left wall comes nearer ahead and the right one recedes.
+_SIGN = np.array([[1.0], [-1.0]], np.float32)
 
 
 @struct.dataclass
@@ -61,15 +69,15 @@ class Bumps:
         valid: Whether the beam is used.
     """
 
-    height: Float[Array, "*env 2 side"]
-    along: Float[Array, "*env 2 side"]
-    valid: Bool[Array, "*env 2 side"]
+    height: Float[Array, "2 side"]
+    along: Float[Array, "2 side"]
+    valid: Bool[Array, "2 side"]
 
 
-def begin_walls(batch: tuple[int, ...], n_beams: int) -> Walls:
+def begin_walls(n_beams: int) -> Walls:
     """Return the walls before any scan."""
-    zero, side = jnp.zeros(batch), side_beams(n_beams)[0].shape[1]
-    return Walls(jnp.zeros((*batch, 2)), zero, zero, zero, jnp.zeros((*batch, 2, side)))
+    zero = jnp.zeros(())
+    return Walls(jnp.zeros(2), zero, zero, zero, jnp.zeros(side_beams(n_beams)[0].shape))
 
 
 def side_beams(n_beams: int, most: int = _MOST_BEAMS) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -86,70 +94,56 @@ def height_variance(n_beams: int, model_sigma: float) -> Float[np.ndarray, "2 si
     return np.square(_RANGE_SIGMA * side_beams(n_beams)[1]) + np.float32(model_sigma**2)
 
 
-def track_walls(walls: Walls, ranges: Float[Array, "*env n_beams"], share: Float[Array, "*env"]) -> tuple[Walls, Bumps]:
-    """Tracks the walls through a scan, and measures their relief.
+def track_walls(walls: Walls, ranges: Float[Array, "n_beams"], share: Float[Array, ""]) -> tuple[Walls, Bumps]:
+    """Track the walls through a scan, and measure their relief.
 
     Args:
         walls: Walls before the scan.
         ranges: The scan, m, the first beam straight ahead, the others counter-clockwise.
         share: Distance driven since the last scan, in usual steps of 0.2 m, at most 2.
     """
-    index, sine, cosine = side_beams(ranges.shape[-1])
-    across, along = ranges[..., index] * sine, ranges[..., index] * cosine
-    precision = 1.0 / height_variance(ranges.shape[-1], _FIT_SIGMA)
+    index, sine, cosine = side_beams(ranges.shape[0])
+    across, along = ranges[index] * sine, ranges[index] * cosine
+    precision = 1.0 / height_variance(ranges.shape[0], _FIT_SIGMA)
     usable = (across > _NEAREST) & (across < _FARTHEST)
     weight = jnp.where(usable, precision * (precision.size / max(float(np.sum(precision)), 1.0)), 0.0)
     pair, loose = _choose_pair(walls, across, along, weight)
     fitted = _fit_pair(pair, loose, across, along, weight)
-    height = across - _wall_distance(fitted, along)
-    seen = (weight > 0.0) & (jnp.abs(fitted.slope) < _STEEP)[..., None, None]
-    valid = seen & (height > _SHORT) & (height < _LONG)
-    usual = walls.usual + _USUAL * share[..., None, None] * jnp.where(valid, height - walls.usual, 0.0)
-    scans = walls.scans + jnp.where(jnp.sum(valid, axis=(-2, -1)) >= 3, 1.0, 0.0)
+    height = across - fitted.at(along)
+    valid = (weight > 0.0) & (jnp.abs(fitted.slope) < _STEEP) & (height > _SHORT) & (height < _LONG)
+    usual = walls.usual + _USUAL * share * jnp.where(valid, height - walls.usual, 0.0)
+    scans = walls.scans + jnp.where(jnp.sum(valid) >= 3, 1.0, 0.0)
     height = jnp.where(valid, jnp.clip(height - walls.usual, *_CLIP), 0.0)
-    return Walls(fitted.distance, fitted.slope, fitted.bend, scans, usual), Bumps(height, along, valid)
-
-
-def _wall_distance(walls: Walls, along: Float[Array, "*env 2 side"]) -> Float[Array, "*env 2 side"]:
-    """Distance of each wall to the side at the end of each beam, m."""
-    slope, bend = walls.slope[..., None, None], walls.bend[..., None, None]
-    return walls.distance[..., None] + _signed(slope + 0.5 * bend * along, along)
-
-
-def _signed(factor: Array, along: Float[Array, "*env 2 side"]) -> Float[Array, "*env 2 side"]:
-    """Product with its sign for each wall: turned left, the left wall comes nearer ahead and the right one recedes."""
-    return jnp.asarray([[1.0], [-1.0]]) * factor * along
+    return dataclasses.replace(fitted, scans=scans, usual=usual), Bumps(height, along, valid)
 
 
 def _choose_pair(
-    walls: Walls, across: Float[Array, "*env 2 side"], along: Float[Array, "*env 2 side"], weight: Array
-) -> tuple[Walls, Bool[Array, "*env"]]:
+    walls: Walls, across: Float[Array, "2 side"], along: Float[Array, "2 side"], weight: Float[Array, "2 side"]
+) -> tuple[Walls, Bool[Array, ""]]:
     """The pair of walls with most beams on it, and whether it differs from the tracked one.
 
     Candidates have one of several slopes, and pass through the end of a beam or at the distance of the tracked wall.
     """
     settled = jnp.minimum(walls.scans / _SETTLED, 1.0)
-    slope = walls.slope[..., None] + _SLOPES
-    bent = across - _signed(0.5 * walls.bend[..., None, None] * along, along)
-    foot = bent[..., None, :, :] - _signed(slope[..., None, None], along[..., None, :, :])
-    old = jnp.broadcast_to(walls.distance[..., None, :, None], (*foot.shape[:-1], 1))
+    slope = walls.slope + _SLOPES
+    bent = across - _SIGN * 0.5 * walls.bend * along * along
+    foot = bent - slope[:, None, None] * _SIGN * along
+    old = jnp.broadcast_to(walls.distance[:, None], (len(_SLOPES), 2, 1))
     distance = jnp.concatenate([foot, old], axis=-1)
     near = _bell((distance[..., :, None] - foot[..., None, :]) / _ON_WALL)
-    score = jnp.sum(weight[..., None, :, None, :] * near, axis=-1)
-    score = score + settled[..., None, None, None] * _bell((distance - old) / _TRACKED)
-    usable = jnp.concatenate([weight > 0.0, jnp.ones((*weight.shape[:-1], 1), bool)], axis=-1)
-    score = jnp.where(usable[..., None, :, :], score, -1.0)
+    score = jnp.sum(weight[:, None, :] * near, axis=-1) + settled * _bell((distance - old) / _TRACKED)
+    usable = jnp.concatenate([weight > 0.0, jnp.ones((2, 1), bool)], axis=-1)
+    score = jnp.where(usable, score, -1.0)
     best = jnp.argmax(score, axis=-1, keepdims=True)
     distance = jnp.take_along_axis(distance, best, axis=-1)[..., 0]
-    pair = jnp.sum(jnp.max(score, axis=-1), axis=-1) - 0.5 * settled[..., None] * np.square(_SLOPES / 0.06)
-    at = jnp.argmax(pair, axis=-1, keepdims=True)
-    kept = jnp.sum(score[..., len(_SLOPES) // 2, :, -1], axis=-1)
-    other = (jnp.max(pair, axis=-1) - kept > _MORE) | (walls.scans < 1.0)
-    best_distance = jnp.take_along_axis(distance, at[..., None], axis=-2)[..., 0, :]
-    best_slope = jnp.clip(jnp.take_along_axis(slope, at, axis=-1)[..., 0], -2.0 * _STEEP, 2.0 * _STEEP)
-    distance = jnp.where(other[..., None], best_distance, walls.distance)
-    slope = jnp.where(other, best_slope, walls.slope)
-    return dataclasses.replace(walls, distance=distance, slope=slope), other
+    pair = jnp.sum(jnp.max(score, axis=-1), axis=-1) - 0.5 * settled * np.square(_SLOPES / 0.06)
+    at = jnp.argmax(pair)
+    kept = jnp.sum(score[len(_SLOPES) // 2, :, -1])
+    other = (pair[at] - kept > _MORE) | (walls.scans < 1.0)
+    found = jnp.clip(slope[at], -2.0 * _STEEP, 2.0 * _STEEP)
+    choose = lambda new, now: jnp.where(other, new, now)  # noqa: E731
+    chosen = dataclasses.replace(walls, distance=choose(distance[at], walls.distance), slope=choose(found, walls.slope))
+    return chosen, other
 
 
 def _bell(value: Array) -> Array:
@@ -157,20 +151,19 @@ def _bell(value: Array) -> Array:
     return jnp.exp(-0.5 * value * value)
 
 
-def _fit_pair(walls: Walls, loose: Bool[Array, "*env"], across: Array, along: Array, weight: Array) -> Walls:
-    """Fits the walls by least squares, weights redescending, with the last walls as prior; one unknown at a time."""
+def _fit_pair(walls: Walls, loose: Bool[Array, ""], across: Array, along: Array, weight: Array) -> Walls:
+    """Fit the walls by least squares, weights redescending, with the last walls as prior; one unknown at a time."""
     loose = loose | (walls.scans < _SETTLED)
     keep, keep_slope = jnp.where(loose, 0.3, _KEEP), jnp.where(loose, 0.5, _KEEP_SLOPE)
-    row = _signed(jnp.ones_like(along), along)
+    row = along * _SIGN
     now = walls
     for _ in range(3):
         rest, trust = _residuals(now, across, along, weight)
-        pull = keep[..., None] * (walls.distance - now.distance)
-        moved = (jnp.sum(trust * rest, axis=-1) + pull) / (jnp.sum(trust, axis=-1) + keep[..., None])
-        now = dataclasses.replace(now, distance=now.distance + moved)
+        moved = jnp.sum(trust * rest, axis=-1) + keep * (walls.distance - now.distance)
+        now = dataclasses.replace(now, distance=now.distance + moved / (jnp.sum(trust, axis=-1) + keep))
         rest, trust = _residuals(now, across, along, weight)
         now = dataclasses.replace(now, slope=_solve_shared(walls.slope, now.slope, row, rest, trust, keep_slope))
-        rest = across - _wall_distance(now, along)
+        rest = across - now.at(along)
         bend = _solve_shared(walls.bend, now.bend, 0.5 * row * along, rest, trust, jnp.asarray(_KEEP_BEND))
         now = dataclasses.replace(now, bend=jnp.clip(bend, -_SHARPEST, _SHARPEST))
     return now
@@ -178,11 +171,11 @@ def _fit_pair(walls: Walls, loose: Bool[Array, "*env"], across: Array, along: Ar
 
 def _residuals(walls: Walls, across: Array, along: Array, weight: Array) -> tuple[Array, Array]:
     """Residuals, m, and the redescending weights."""
-    rest = across - _wall_distance(walls, along)
+    rest = across - walls.at(along)
     return rest, weight / jnp.square(1.0 + jnp.square(rest / _REDESCEND))
 
 
 def _solve_shared(before: Array, now: Array, row: Array, rest: Array, trust: Array, keep: Array) -> Array:
     """One unknown shared by both walls, after one step of least squares."""
-    size = jnp.sum(trust * row * row, axis=(-2, -1)) + keep
-    return now + (jnp.sum(trust * row * rest, axis=(-2, -1)) + keep * (before - now)) / size
+    size = jnp.sum(trust * row * row) + keep
+    return now + (jnp.sum(trust * row * rest) + keep * (before - now)) / size

@@ -13,8 +13,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from subterra_jax.baselines.agent import Action, Known, Observed, n_ranges
 from subterra_jax.baselines.avoidance import steering_of
-from subterra_jax.baselines.navigator import Memory, Navigator
-from subterra_jax.baselines.steering import CentreLine, PacedSteering, Steering
+from subterra_jax.baselines.navigator import Memory, Navigator, Pace
+from subterra_jax.baselines.steering import CentreLine
 from subterra_jax.policies.files import Conditions, PolicyError
 from subterra_jax.policies.localised import Localised
 from subterra_jax.policies.locate.map_strip import MapStrip
@@ -80,7 +80,5 @@ class Locating(Localised):
         return self._navigator(params).act(key, memory, obs, params, known)
 
     def _navigator(self, params: EnvParams) -> Navigator:
-        steered: Steering = steering_of(params, CentreLine())
-        if self.speed is not None:
-            steered = PacedSteering(steered, self.speed)
-        return Navigator(self.given.localiser(params), steered, name=self.name)
+        pace = Pace() if self.speed is None else Pace(self.speed)
+        return Navigator(self.given.localiser(params), steering_of(params, CentreLine()), name=self.name, pace=pace)
