@@ -92,8 +92,7 @@ class Memory:
             localiser, anywhere = given.localiser(params), params.errand == "report"
             start, sigma = believed_start(obs, params) if anywhere else (told_start(obs, params), 0.05)
             station = Station(jnp.asarray(start, jnp.float32), jnp.log(jnp.float32(sigma)), jnp.ones(()))
-            memory = localiser.begin_anywhere(obs, params) if anywhere else localiser.begin(obs, params)
-            located = Located(CentreLine().begin(obs, params), jnp.ones(()), memory, station)
+            located = Located(CentreLine().begin(obs, params), jnp.ones(()), localiser.begin(obs, params), station)
         seen = self._look(reckoned, located, obs, params)
         return Kept(reckoned, jnp.repeat(seen[None], self.frames - 1, axis=0), located, seen)
 
