@@ -1,6 +1,6 @@
 """Params (what a task is) and state (what changes) of an environment: a few fields of its own, and those of its parts.
 
-`params.odometry`, `state.slip`: what the package's own parts and rules have is read by its name, with a type. What a
+`params.odometry`, `state.slip`: what the package's own parts and rules have is read by its name, which a type checker knows. What a
 part or a rule from outside has is an entry of `parts`.
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any, Generic, TypeVar, overload
+from typing import Any, Generic, TypeVar, overload
 
 import jax
 import jax.numpy as jnp
@@ -19,16 +19,6 @@ from jaxtyping import Array, Float, Int
 
 from subterra_jax.rows import vary_like
 from subterra_jax.tunnel import Tunnel
-
-if TYPE_CHECKING:  # they import this module themselves
-    from subterra_jax.parts.faults import FaultParams, FaultState
-    from subterra_jax.parts.imu import ImuParams, ImuState
-    from subterra_jax.parts.obstacles import ObstacleParams, ObstacleState
-    from subterra_jax.parts.odometer import OdometryParams, OdometryState
-    from subterra_jax.parts.slip import SlipParams, SlipState
-    from subterra_jax.parts.unicycle import VehicleParams
-    from subterra_jax.rules.rule import StartParams
-    from subterra_jax.rules.stop import GoalParams, ToldParams
 
 
 def as_array(value: Any, like: Any = None) -> Any:
@@ -136,17 +126,17 @@ class _Entry(Generic[_T]):
 
 
 class _ParamsOfParts(_Named):
-    vehicle: _Entry[VehicleParams] = _Entry()
+    vehicle: _Entry[Any] = _Entry()
     lidar: _Entry[Any] = _Entry()  # `LidarParams`, or `SpatialParams`
-    odometry: _Entry[OdometryParams] = _Entry()
-    start: _Entry[StartParams] = _Entry()
+    odometry: _Entry[Any] = _Entry()
+    start: _Entry[Any] = _Entry()
     reward: _Entry[Any] = _Entry()  # the rule's
-    slip: _Entry[SlipParams] = _Entry()
-    obstacles: _Entry[ObstacleParams] = _Entry()
-    faults: _Entry[FaultParams] = _Entry()
-    imu: _Entry[ImuParams] = _Entry()
-    goal: _Entry[GoalParams] = _Entry()
-    told: _Entry[ToldParams] = _Entry()
+    slip: _Entry[Any] = _Entry()
+    obstacles: _Entry[Any] = _Entry()
+    faults: _Entry[Any] = _Entry()
+    imu: _Entry[Any] = _Entry()
+    goal: _Entry[Any] = _Entry()
+    told: _Entry[Any] = _Entry()
     goal_coverage: _Entry[Float[Array, ""]] = _Entry()
     walk: _Entry[Any] = _Entry()  # the walking robot, its gait, and the surface that it sees: `b2.mission`
     policy: _Entry[Any] = _Entry()
@@ -155,11 +145,11 @@ class _ParamsOfParts(_Named):
 
 class _StatesOfParts(_Named):
     goal: _Entry[Any] = _Entry()  # the rule's
-    odometry: _Entry[OdometryState] = _Entry()
-    slip: _Entry[SlipState] = _Entry()
-    obstacles: _Entry[ObstacleState] = _Entry()
-    faults: _Entry[FaultState] = _Entry()
-    imu: _Entry[ImuState] = _Entry()
+    odometry: _Entry[Any] = _Entry()
+    slip: _Entry[Any] = _Entry()
+    obstacles: _Entry[Any] = _Entry()
+    faults: _Entry[Any] = _Entry()
+    imu: _Entry[Any] = _Entry()
     legs: _Entry[Any] = _Entry()  # of `b2.mission`
 
 
