@@ -1,7 +1,7 @@
 """Params (what a task is) and state (what changes) of an environment: a few fields of its own, and those of its parts.
 
-`params.odometry`, `state.slip`: what the package's own parts and rules have is read by its name, which a type checker knows. What a
-part or a rule from outside has is an entry of `parts`.
+`params.odometry`, `state.slip`: what the package's own parts and rules have is an attribute, and a misspelt one is
+found by a type checker. What a part or a rule from outside has is an entry of `parts`.
 """
 
 from __future__ import annotations
