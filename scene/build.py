@@ -290,8 +290,8 @@ def command(
     Example: python -m scene.build survey.bag --trajectory groundtruth.tum --out build/tunnel
 
     Args:
-        source: A bag (ROS1, ROS2, MCAP), a folder of bags or of timed scans, a cloud (PLY, PCD, LAS, E57, PTX,
-            PTS, XYZ, CSV, Parquet) or a ring survey (CSV, XLSX).
+        source: A bag (ROS1, ROS2, MCAP), a folder of bags or of timed scans, a cloud (PLY, PCD, LAS, E57,
+            PTX, PTS, XYZ, CSV, Parquet) or a ring survey (CSV, XLSX).
         more: Further bags of the same recording.
         out: Folder to write; replaced only once the new scene is complete.
         trajectory: Poses of the LiDAR in TUM form, for a bag; without it, LiDAR odometry.
