@@ -48,6 +48,19 @@ def pytest_unconfigure() -> None:
         shutil.rmtree(_OWN_CACHE, ignore_errors=True)
 
 
+SLOW = Path(__file__).with_name("slow.txt")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Marks as slow what `slow.txt` names, so that the run of every change stays short; `make test-slow` runs it."""
+    named = set(SLOW.read_text().splitlines())
+    for item in items:
+        function = item.nodeid.partition("[")[0]
+        if named & {item.nodeid, function, function.partition("::")[0]}:
+            item.add_marker(pytest.mark.slow)
+
+
 @pytest.fixture(scope="module", autouse=True)
 def bounded_memory() -> Iterator[None]:
     """Forgets compiled programs between files once the process has grown large; the folder still has them."""

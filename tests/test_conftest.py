@@ -57,3 +57,11 @@ def test_memory_is_given_back_so_that_files_after_a_large_one_keep_their_program
         "assert conftest.resident() < before - 0.2e9, (before, conftest.resident())",
     ])  # fmt: skip
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
+
+
+def test_what_the_list_of_slow_tests_names_is_there():
+    lines = [line for line in conftest.SLOW.read_text().splitlines() if not line.startswith("#")]
+    assert lines == sorted(set(lines))
+    for line in lines:
+        file, _, name = line.partition("[")[0].partition("::")
+        assert f"def {name}" in (ROOT / file).read_text(), line
