@@ -48,7 +48,7 @@ def run_main(
 
 
 class Ran(NamedTuple):
-    """How a command ended.
+    """End of a command.
 
     Attributes:
         status: Exit status.

@@ -50,7 +50,7 @@ class ReconstructionConfig:
 
 
 class Figure(NamedTuple):
-    """How a figure is shown and recorded, and its limits with true poses and with control, in its unit."""
+    """Name, unit and record of a figure, and its limits with true poses and with control, in its unit."""
 
     record: str
     unit: str

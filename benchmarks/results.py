@@ -1,4 +1,4 @@
-"""What every result is written with: facts of the machine, tables, pictures, files whole or not at all."""
+"""Writing of results: facts of the machine, tables, pictures, files whole or not at all."""
 
 import io
 import os

@@ -38,7 +38,7 @@ TOLD_BY: dict[str, tuple[Code, ...]] = {
 
 @dataclass(frozen=True)
 class Fault:
-    """What is wrong with a built scene by more than the tolerances.
+    """Faults of a built scene beyond the tolerances.
 
     Attributes:
         kind: A key of `TOLD_BY`.

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 
 class Code(StrEnum):
-    """What a warning is about."""
+    """Subject of a warning."""
 
     # How the input was read and posed
     AXES = "axes"  # Y was taken as up

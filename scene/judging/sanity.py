@@ -1,4 +1,4 @@
-"""What no tunnel has, each with its likely cause (unit, axes, poses, clock), and tracks laid beyond what was seen."""
+"""Checks for what no tunnel has, with likely causes (unit, axes, poses, clock), and for tracks beyond what was seen."""
 
 from typing import Any
 

@@ -189,7 +189,7 @@ class _Chain:
 
     @property
     def connections(self) -> list[Any]:
-        """Those of all bags."""
+        """Topics and types of all bags."""
         return [connection for own in self._connections for connection in own]
 
     def messages(self, connections: Iterable[Any]) -> Iterator[tuple[Any, int, bytes]]:

@@ -1,4 +1,4 @@
-"""What is built into the bore, rings, bolt pockets, nails, sleepers, rails: its sizes, and its places."""
+"""Things built into the bore, rings, bolt pockets, nails, sleepers, rails: its sizes, and its places."""
 
 from dataclasses import dataclass, fields
 

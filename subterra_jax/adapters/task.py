@@ -1,4 +1,4 @@
-"""What Gymnasium's single environment and its batch have in common: a made task, its moments and its pictures."""
+"""Base of Gymnasium's single environment and of its batch: a made task, its moments and its pictures."""
 
 import functools
 import os

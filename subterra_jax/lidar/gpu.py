@@ -120,7 +120,7 @@ def _call(kernel: Any, grid: tuple[int, ...], size: int) -> Any:
 
 
 class _Visit(NamedTuple):
-    """Where a thread is on its way.
+    """Place of a thread on its way.
 
     Attributes:
         block: Block that it visits.

@@ -1,4 +1,4 @@
-"""What a policy's file says of its network: memory, sizes, bounds of the action."""
+"""Network of a policy's file: memory, sizes, bounds of the action."""
 
 import dataclasses
 from collections.abc import Mapping

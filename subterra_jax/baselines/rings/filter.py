@@ -94,7 +94,7 @@ class Estimate:
 
 @struct.dataclass
 class RingTrack:
-    """What the rings have told.
+    """Estimate by the rings.
 
     Attributes:
         walls: The tracked walls.
