@@ -90,7 +90,6 @@ class AutoReset:
         return obs, merged, reward, terminated, truncated, info
 
     def _checked(self, action: Any, state: State) -> Array:
-        """Actions as an array with one row for each environment."""
         action, n_envs = jnp.asarray(action), jax.tree.leaves(state)[0].shape[0]
         if action.ndim != 2 or action.shape[0] != n_envs:
             wanted = f"({n_envs}, {getattr(self.env, 'action_size', 'n_action')})"
@@ -212,7 +211,6 @@ def _roll(
     params: EnvParams,
     memory: Any,
 ) -> tuple[Obs, State, dict[str, Any]]:
-    """Scan over the steps of a rollout."""
     remembers = hasattr(policy, "initial_memory")
     if remembers and memory is None:
         memory = policy.initial_memory(jax.random.fold_in(key, n_steps), obs.shape[0])

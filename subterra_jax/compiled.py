@@ -121,17 +121,12 @@ def run_compiled(function: Callable[..., Any], *args: Any) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class _Program:
-    """A traced function, as a static argument.
+    """A traced function, as a static argument."""
 
-    Attributes:
-        text: The program, printed.
-        held: Identities of arrays that compiled functions inside of it hold; the program keeps them alive.
-        program: The program, without the arrays that it takes from outside.
-    """
-
-    text: str
+    text: str  # the program, printed
+    # identities of arrays that compiled functions inside of it hold; the program keeps them alive
     held: tuple[int, ...]
-    program: Any = dataclasses.field(compare=False)
+    program: Any = dataclasses.field(compare=False)  # the program, without the arrays that it takes from outside
 
 
 @functools.partial(jax.jit, static_argnums=0)

@@ -26,59 +26,35 @@ from subterra_jax.tunnel_env import TunnelEnv
 
 @struct.dataclass
 class Episode:
-    """One episode under way.
+    """One episode under way."""
 
-    Attributes:
-        env_key: Key of the environment.
-        agent_key: Key of the agent.
-        tunnel: Number of the tunnel in a stack.
-        level: Level of difficulty.
-        state: State of the environment.
-        noise: Random numbers of the scan to be taken next.
-        memory: Memory of the agent.
-        tally: What the caller counts.
-        over: The environment has ended the episode.
-    """
-
-    env_key: PRNGKeyArray
-    agent_key: PRNGKeyArray
-    tunnel: Int[Array, ""]
-    level: Int[Array, ""]
-    state: State
-    noise: Any
-    memory: Any
-    tally: Any
-    over: Bool[Array, ""]
+    env_key: PRNGKeyArray  # key of the environment
+    agent_key: PRNGKeyArray  # key of the agent
+    tunnel: Int[Array, ""]  # number of the tunnel in a stack
+    level: Int[Array, ""]  # level of difficulty
+    state: State  # state of the environment
+    noise: Any  # random numbers of the scan to be taken next
+    memory: Any  # memory of the agent
+    tally: Any  # what the caller counts
+    over: Bool[Array, ""]  # the environment has ended the episode
 
 
 @struct.dataclass
 class Taken:
-    """One step taken, as those who count or record see it.
+    """One step taken, as those who count or record see it."""
 
-    Attributes:
-        before: State before.
-        observation: Observation that the agent acted on.
-        action: Action as the agent gave it: speed (m/s), yaw rate (rad/s), estimated station (m; NaN for none), log of
-            its standard deviation, direction.
-        memory: Memory of the agent afterwards.
-        after: State afterwards.
-        noise: Random numbers of the step, for the scan of `after`.
-        reward: Reward.
-        terminated: The episode ended for good.
-        truncated: The episode ended at the horizon.
-        info: The step's info.
-    """
-
-    before: State
-    observation: Float[Array, n_obs]
+    before: State  # state before
+    observation: Float[Array, n_obs]  # observation that the agent acted on
+    # action as the agent gave it: speed (m/s), yaw rate (rad/s), estimated station (m; NaN for none), log of its
+    # standard deviation, direction
     action: Float[Array, 5]
-    memory: Any
-    after: State
-    noise: Any
-    reward: Float[Array, ""]
-    terminated: Bool[Array, ""]
-    truncated: Bool[Array, ""]
-    info: Info
+    memory: Any  # memory of the agent afterwards
+    after: State  # state afterwards
+    noise: Any  # random numbers of the step, for the scan of `after`
+    reward: Float[Array, ""]  # reward
+    terminated: Bool[Array, ""]  # the episode ended for good
+    truncated: Bool[Array, ""]  # the episode ended at the horizon
+    info: Info  # the step's info
 
 
 Start = Callable[[State, EnvParams], Any]
@@ -106,19 +82,14 @@ def keep_nothing(now: Episode, taken: Taken, params: EnvParams) -> tuple[()]:
 
 @dataclasses.dataclass(frozen=True)
 class Driver:
-    """Drives an agent through episodes of one task. Static: its functions must be module-level, so that jit knows them.
+    """Drives an agent through episodes of one task. Static: jit knows its functions, which must be module-level."""
 
-    Attributes:
-        env: The environment; its action holds the estimate where the caller wants it scored.
-        start: Makes the tally of an episode, from the first state and the params of its tunnel and level.
-        add: From an episode, a step taken and those params to the tally and to whether the episode is over.
-        keep: From the same to what is kept of the step.
-    """
-
-    env: TunnelEnv
+    env: TunnelEnv  # the environment; its action holds the estimate where the caller wants it scored
+    # makes the tally of an episode, from the first state and the params of its tunnel and level
     start: Start = count_nothing
+    # from an episode, a step taken and those params to the tally and to whether the episode is over
     add: Add = until_the_end
-    keep: Keep = keep_nothing
+    keep: Keep = keep_nothing  # from the same to what is kept of the step
 
     @in_32_bits()
     def begin(self, params: EnvParams, agent: Agent, seed: Any, tunnel: Any = 0, level: Any = None) -> Episode:

@@ -95,7 +95,6 @@ def _find(params: EnvParams, name: str) -> Array:
 
 
 def _entry(node: Any, name: str) -> Any:
-    """An entry of the params, or a field of it."""
     return node.parts[name] if isinstance(node, EnvParams) and name in node.parts else getattr(node, name)
 
 
@@ -146,7 +145,6 @@ def _check(params: EnvParams, bounds: dict[str, tuple[int | float, int | float]]
 def _draw(
     key: PRNGKeyArray, dtype: Any, shape: tuple[int, ...], low: int | float, high: int | float, log: bool
 ) -> Array:
-    """Numbers between two bounds."""
     if jnp.issubdtype(dtype, jnp.integer):
         return jax.random.randint(key, shape, int(low), int(high) + 1, dtype)
     if log:
@@ -155,7 +153,6 @@ def _draw(
 
 
 def _replace_part(node: Any, path: list[str], value: Any) -> Any:
-    """A tree of dataclasses with one part exchanged."""
     if len(path) > 1:
         value = _replace_part(_entry(node, path[0]), path[1:], value)
     return node.replace(**{path[0]: value})

@@ -88,7 +88,6 @@ def slope_along(function: Callable[..., jax.Array], primals: tuple[Any, ...], ta
 
 
 def _instantiate(primal: Any, tangent: Any) -> Any:
-    """A symbolic zero as an array of zeros."""
     if not isinstance(tangent, SymbolicZero):
         return tangent
     if not jnp.issubdtype(jnp.result_type(primal), jnp.floating):

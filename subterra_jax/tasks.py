@@ -42,23 +42,16 @@ class TaskError(SubterraError, ValueError):
 
 @dataclasses.dataclass(frozen=True)
 class Task:
-    """One row of the task table.
+    """One row of the task table."""
 
-    Attributes:
-        rule: Rule of the task.
-        horizon: Steps after which an episode is truncated.
-        piece: Start and length of the piece of tunnel that the task happens in, m; None for the whole tunnel.
-        parts: Sensors, errors and obstacles, in the order in which they act.
-        params: Entries of `EnvParams` that differ from the defaults of parts and rule.
-        tunnel: Tunnel where none is named; None for some of the open world.
-    """
-
-    rule: Rule
-    horizon: int
+    rule: Rule  # rule of the task
+    horizon: int  # steps after which an episode is truncated
+    # start and length of the piece of tunnel that the task happens in, m; None for the whole tunnel
     piece: tuple[float, float] | None = None
-    parts: tuple[Part, ...] = PLAIN
+    parts: tuple[Part, ...] = PLAIN  # sensors, errors and obstacles, in the order in which they act
+    # entries of `EnvParams` that differ from the defaults of parts and rule
     params: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    tunnel: str | None = None
+    tunnel: str | None = None  # tunnel where none is named; None for some of the open world
 
 
 def _drifting(**params: Any) -> dict[str, Any]:
@@ -310,6 +303,5 @@ def _benchmark_digest() -> str:
 
 
 def _without_tunnel(id: str, task: Task) -> tuple[TunnelEnv, EnvParams]:
-    """Environment and params of a task in no tunnel."""
     env = TunnelEnv(id=id, rule=task.rule, parts=task.parts)
     return env, make_params(env, (), task.horizon, collect_entries(env, task.params))

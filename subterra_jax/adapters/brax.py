@@ -164,11 +164,9 @@ class RandomizedVmapWrapper(Wrapper):
         self._batch, self._axes = randomization_fn(self.unwrapped.sys)
 
     def reset(self, rng: jax.Array) -> State:
-        """Begin an episode in each environment."""
         return self._with_own_params(self.env.reset, rng)
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Take one step in each environment."""
         return self._with_own_params(self.env.step, state, action)
 
     def _with_own_params(self, function: Callable[..., State], *arguments: Any) -> State:

@@ -26,7 +26,6 @@ class GymnaxParams(EnvParams):
 
     @property
     def max_steps_in_episode(self) -> Any:
-        """Steps after which an episode is truncated."""
         return self.horizon
 
     def replace(self, **updates: Any) -> "GymnaxParams":

@@ -61,19 +61,13 @@ def first_cpu() -> jax.Device:
 
 
 class Programs(NamedTuple):
-    """Compiled reset and step, which take and return flat arrays.
+    """Compiled reset and step, which take and return flat arrays."""
 
-    Attributes:
-        reset: From a stream to the stream with the state, and the observation.
-        begin: Compiles, at its first call, and returns the program of a reset to a chosen place.
-        step: From stream with state, and action, to stream with state, and report.
-        read: From a report's words to a report.
-    """
-
-    reset: Callable[..., Any]
+    reset: Callable[..., Any]  # from a stream to the stream with the state, and the observation
+    # compiles, at its first call, and returns the program of a reset to a chosen place
     begin: Callable[[], Callable[..., Any]]
-    step: Callable[..., Any]
-    read: Callable[[np.ndarray], Report]
+    step: Callable[..., Any]  # from stream with state, and action, to stream with state, and report
+    read: Callable[[np.ndarray], Report]  # from a report's words to a report
 
 
 @dataclasses.dataclass(frozen=True)

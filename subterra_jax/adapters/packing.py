@@ -92,21 +92,13 @@ def take_key(stream: UInt32[Array, "2"]) -> tuple[PRNGKeyArray, UInt32[Array, "2
 
 
 class Report(NamedTuple):
-    """Result of one step, or of a batch of steps.
+    """Result of one step, or of a batch of steps."""
 
-    Attributes:
-        obs: Observation, `(..., n_obs)`.
-        reward: Reward, `(...)`.
-        terminated: Whether the episode ended before the horizon, `(...)`.
-        truncated: Whether it ended at the horizon, `(...)`.
-        info: The environment's own `info`.
-    """
-
-    obs: Any
-    reward: Any
-    terminated: Any
-    truncated: Any
-    info: dict[str, Any]
+    obs: Any  # observation, `(..., n_obs)`
+    reward: Any  # reward, `(...)`
+    terminated: Any  # whether the episode ended before the horizon, `(...)`
+    truncated: Any  # whether it ended at the horizon, `(...)`
+    info: dict[str, Any]  # the environment's own `info`
 
 
 def python_reader(example: Report) -> Callable[[np.ndarray], Report]:

@@ -36,7 +36,6 @@ class EnvRow:
         return None if self.render_mode is None else self._envs.picture(self._index)
 
     def has_wrapper_attr(self, name: str) -> bool:
-        """Return whether the attribute exists."""
         return hasattr(self, name)
 
     def get_wrapper_attr(self, name: str) -> Any:

@@ -112,7 +112,6 @@ class Task:
         return self
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Leave out what is compiled."""
         return Task, (self.env, self.params, self.flat, self.compile)
 
 
@@ -155,26 +154,19 @@ def check_mode(render_mode: str | None) -> None:
 
 
 class Door:
-    """A task behind Gymnasium's methods; the base of `SubterraEnv` and `SubterraVectorEnv`.
+    """A task behind Gymnasium's methods; the base of `SubterraEnv` and `SubterraVectorEnv`."""
 
-    Attributes:
-        task: The task.
-        view: What draws its pictures.
-    """
-
-    task: Task
-    view: View
+    task: Task  # the task
+    view: View  # what draws its pictures
     _obs: np.ndarray | None = None  # last observations; `None` before the first reset
     _pending: Any = None  # environments of a batch whose episode is over, `(n,)`
 
     @property
     def task_env(self) -> TunnelEnv:
-        """The JAX environment."""
         return self.task.env
 
     @property
     def task_params(self) -> EnvParams:
-        """Its params."""
         return self.task.params
 
     def get_state(self) -> Moment:

@@ -212,7 +212,6 @@ class SubterraVectorEnv(Door, VectorEnv[Observation, np.ndarray, np.ndarray]):
         self._rows = jax.tree.map(jnp.asarray, Rows(stream, state, obs))
 
     def _empty(self) -> Rows:
-        """Return rows of zeros for the first reset to fill."""
         zeros = lambda leaf: jnp.zeros((self.num_envs, *leaf.shape), leaf.dtype)  # noqa: E731
         return jax.tree.map(zeros, Rows(jax.ShapeDtypeStruct((2,), np.uint32), self.task.state, self.task.report.obs))
 

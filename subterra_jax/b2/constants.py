@@ -20,16 +20,11 @@ Vector = tuple[float, float, float]
 
 @dataclasses.dataclass(frozen=True)
 class Inertial:
-    """Mass and inertia of one body.
+    """Mass and inertia of one body."""
 
-    Attributes:
-        mass: Mass, kg.
-        com: Centre of mass in the body's frame, m.
-        inertia: Inertia xx, yy, zz, xy, xz, yz about the centre of mass, along the body's axes, kg m².
-    """
-
-    mass: float
-    com: Vector
+    mass: float  # mass, kg
+    com: Vector  # centre of mass in the body's frame, m
+    # inertia xx, yy, zz, xy, xz, yz about the centre of mass, along the body's axes, kg m²
     inertia: tuple[float, float, float, float, float, float]
 
     def mirrored(self, left: bool, front: bool) -> "Inertial":
@@ -84,28 +79,18 @@ ENVELOPE = (1.098, 0.450, 0.645)  # standing. Source: docs.westonrobot.com/robot
 
 @dataclasses.dataclass(frozen=True)
 class Joint:
-    """Properties of one kind of joint.
+    """Properties of one kind of joint."""
 
-    Attributes:
-        axis: Axis in the body's frame.
-        low: Least angle, rad.
-        high: Largest angle, rad.
-        torque: Largest torque, N m.
-        speed: Largest speed, rad/s.
-        armature: Inertia of the rotor seen through the gear, kg m². Inferred: the URDF's rotor (2.63e-4 kg m²) through
-            ratios of 15 and 24, those of Unitree's motors of the same torque (M107-15, M107-24 of the H1-2).
-        stiffness: Stiffness of the position servo, N m/rad.
-        damping: Damping of the position servo, N m s/rad.
-    """
-
-    axis: Vector
-    low: float
-    high: float
-    torque: float
-    speed: float
+    axis: Vector  # axis in the body's frame
+    low: float  # least angle, rad
+    high: float  # largest angle, rad
+    torque: float  # largest torque, N m
+    speed: float  # largest speed, rad/s
+    # Inertia of the rotor seen through the gear, kg m². Inferred: the URDF's rotor (2.63e-4 kg m²) through ratios of 15
+    # and 24, those of Unitree's motors of the same torque (M107-15, M107-24 of the H1-2).
     armature: float
-    stiffness: float
-    damping: float
+    stiffness: float  # stiffness of the position servo, N m/rad
+    damping: float  # damping of the position servo, N m s/rad
 
 
 # Gains: with the 160/5 that Isaac's configurations give the B2, the zero action collapses under 75 kg; with these it

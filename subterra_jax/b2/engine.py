@@ -57,7 +57,6 @@ class Workbench:
         self.watch: Callable[[mujoco.MjData, Any], None] | None = None
 
     def apply_build(self, build: Build) -> None:
-        """Gives the robot the properties of a build."""
         model, bodies = self.model, self.bodies
         model.geom_friction[self.feet, 0] = build.friction
         model.body_mass[bodies] = self._mass[bodies] * build.mass
@@ -108,7 +107,6 @@ class MujocoPhysics(Physics):
 
     @cached_property
     def bench(self) -> Workbench:
-        """The model and its data."""
         return Workbench(self.spec().compile())
 
     def run(self, body: Body, targets: Float[Array, "12"], around: Surroundings, build: Build) -> Body:
@@ -127,23 +125,17 @@ class MujocoPhysics(Physics):
         return Body(*stacked)
 
     def run_one(self, body: Body, targets: np.ndarray, around: Surroundings, build: Build) -> Body:
-        """Advances one robot by one control period."""
         return self.bench.run(body, targets, around, build, self.substeps)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ScenePhysics(MujocoPhysics):
-    """MuJoCo in C on a scene's own geometry. Feet touch its GROUND geoms, the trunk its LOW_WALL geoms.
+    """MuJoCo in C on a scene's own geometry. Feet touch its GROUND geoms, the trunk its LOW_WALL geoms."""
 
-    Attributes:
-        scene: The MJCF file.
-    """
-
-    scene: Path = Path("scene.xml")
+    scene: Path = Path("scene.xml")  # the MJCF file
 
     @cached_property
     def bench(self) -> Workbench:
-        """The scene with the robot in it."""
         return Workbench(self.scene_spec().compile(), PREFIX)
 
     def scene_spec(self) -> mujoco.MjSpec:

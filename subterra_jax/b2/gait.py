@@ -29,54 +29,32 @@ _CLIP = 10.0  # largest normalised observation, standard deviations
 
 @struct.dataclass
 class GaitParams:
-    """Parameters of the trot.
+    """Parameters of the trot."""
 
-    Attributes:
-        frequency: Strides per second.
-        duty: Share of a stride for which a foot is on the ground.
-        height: Height of the trunk's middle over the ground, m.
-        lift: Height to which a foot is lifted, m: more than a sleeper stands out of the ballast.
-        spread: Distance of the feet outside the legs' own planes, m.
-        still: Commands below this, m/s (rad/s count half), are answered by standing on all feet.
-        startle: Drift above which a standing robot steps to catch itself, m/s.
-        place: Extra distance at which a foot is set down, per drift of the trunk, m per m/s.
-        level: Share of a measured tilt that the legs compensate.
-        learn: Rate at which longer or shorter strides compensate a lasting drift, 1/s.
-        trim_max: Largest such compensation, m/s and rad/s.
-        slew: Fastest change of the commanded velocity, m/s² and rad/s².
-    """
-
-    frequency: float = 2.0
-    duty: float = 0.65
-    height: float = 0.50
-    lift: float = 0.16
-    spread: float = 0.035
-    still: float = 0.1
-    startle: float = 0.3
-    place: float = 0.18
-    level: float = 1.2
-    learn: float = 0.75
-    trim_max: float = 0.35
+    frequency: float = 2.0  # strides per second
+    duty: float = 0.65  # share of a stride for which a foot is on the ground
+    height: float = 0.50  # height of the trunk's middle over the ground, m
+    lift: float = 0.16  # height to which a foot is lifted, m: more than a sleeper stands out of the ballast
+    spread: float = 0.035  # distance of the feet outside the legs' own planes, m
+    still: float = 0.1  # commands below this, m/s (rad/s count half), are answered by standing on all feet
+    startle: float = 0.3  # drift above which a standing robot steps to catch itself, m/s
+    place: float = 0.18  # extra distance at which a foot is set down, per drift of the trunk, m per m/s
+    level: float = 1.2  # share of a measured tilt that the legs compensate
+    learn: float = 0.75  # rate at which longer or shorter strides compensate a lasting drift, 1/s
+    trim_max: float = 0.35  # largest such compensation, m/s and rad/s
+    # fastest change of the commanded velocity, m/s² and rad/s²
     slew: Array | tuple[float, float, float] = (1.5, 1.0, 2.0)
 
 
 @struct.dataclass
 class GaitState:
-    """State of the gait.
+    """State of the gait."""
 
-    Attributes:
-        phase: Phase of the clock, in [0, 1).
-        velocity: The slewed command: forward and to the left (m/s), yaw rate (rad/s).
-        stride: 0 standing to 1 in full stride.
-        trim: Addition to that velocity because the robot was too slow or too fast, m/s and rad/s.
-        offset: Offset of each foot's landing point from the usual one, forward and to the left, m.
-    """
-
-    phase: Float[Array, ""]
-    velocity: Float[Array, "3"]
-    stride: Float[Array, ""]
-    trim: Float[Array, "3"]
-    offset: Float[Array, "4 2"]
+    phase: Float[Array, ""]  # phase of the clock, in [0, 1)
+    velocity: Float[Array, "3"]  # the slewed command: forward and to the left (m/s), yaw rate (rad/s)
+    stride: Float[Array, ""]  # 0 standing to 1 in full stride
+    trim: Float[Array, "3"]  # addition to that velocity because the robot was too slow or too fast, m/s and rad/s
+    offset: Float[Array, "4 2"]  # offset of each foot's landing point from the usual one, forward and to the left, m
 
 
 def standing_gait(phase: Float[Array, ""]) -> GaitState:
@@ -187,18 +165,13 @@ class WalkPolicy:
     """Twelve joint offsets for one observation of `WalkEnv`: the mean of the distribution that was trained.
 
     It equals itself alone, so that `jax.jit(policy)` takes it.
-
-    Attributes:
-        tensors: `statistics.mean` and `statistics.std` of one observation, and the layers `actor.…`.
-        name: Name shown to people.
     """
 
-    tensors: Tensors
-    name: str = struct.field(pytree_node=False, default=RELEASED)
+    tensors: Tensors  # `statistics.mean` and `statistics.std` of one observation, and the layers `actor.…`
+    name: str = struct.field(pytree_node=False, default=RELEASED)  # name shown to people
 
     @property
     def n_observation(self) -> int:
-        """Size of one observation."""
         return self.tensors["statistics.mean"].shape[0]
 
     def act(self, observation: Float[Array, "*batch n_obs"]) -> Float[Array, "*batch 12"]:
@@ -212,14 +185,12 @@ class WalkPolicy:
         return ()
 
     def restart(self, memory: tuple[()], done: Bool[Array, "*env"]) -> tuple[()]:
-        """Return no memory."""
         del done
         return memory
 
     def __call__(
         self, obs: Float[Array, "*batch n_obs"], memory: tuple[()] = (), state: Any = None
     ) -> tuple[Float[Array, "*batch 12"], tuple[()]]:
-        """Return action and no memory."""
         del state
         return self.act(obs), memory
 

@@ -89,12 +89,10 @@ class Legs(Unicycle):
         return draws.draw_reset(key, batch)
 
     def draw_step(self, key: PRNGKeyArray, batch: Batch, params: EnvParams) -> WalkStepNoise:
-        """Draw the noise of each control period."""
         del params
         return draws.draw_step(key, (*batch, PERIODS))
 
     def begin(self, draw: WalkResetNoise, state: State, params: EnvParams) -> LegsState:
-        """Stand where the task has its start."""
         zero = jnp.zeros(())
         return LegsState(stand(state, draw, params.walk), StepSums(zero, zero, zero, zero, zero))
 
@@ -151,7 +149,6 @@ class LegOdometer(Odometer):
     """Distance by the standing legs and heading by the gyroscope, with the bias of the heading that the task states."""
 
     def advance(self, own: OdometryState, step: Step, noise: Noise, params: EnvParams) -> OdometryState:
-        """Add what legs and gyroscope measured."""
         del noise
         sums = step.after[Legs.name].sums
         turned = sums.turn + own.heading_bias * jnp.asarray(params.vehicle.period)
@@ -200,7 +197,6 @@ class TrunkSpatialLidar(SpatialLidar):
         return jnp.broadcast_to(place, (sensor.n_beams, 3)), directions
 
     def relief(self, sight: Sight, params: EnvParams) -> Relief:
-        """Return the surface that is seen."""
         return sight.tunnel.space.relief if params.relief is None else params.relief
 
 

@@ -20,19 +20,12 @@ _PRIVILEGED = {"true_velocity": 3, "fall_speed": 1, "place": 4, "friction": 1, "
 
 @struct.dataclass
 class TrackPose:
-    """Pose of the robot on the track.
+    """Pose of the robot on the track."""
 
-    Attributes:
-        ahead: Distance ahead of the anchor, m.
-        lateral: Offset to the left of the axis, m.
-        height: Height of the trunk's middle over the tops of the sleepers, m.
-        forward: Direction of the trunk's x axis: components along the track and to its left.
-    """
-
-    ahead: Float[Array, ""]
-    lateral: Float[Array, ""]
-    height: Float[Array, ""]
-    forward: Float[Array, "2"]
+    ahead: Float[Array, ""]  # distance ahead of the anchor, m
+    lateral: Float[Array, ""]  # offset to the left of the axis, m
+    height: Float[Array, ""]  # height of the trunk's middle over the tops of the sleepers, m
+    forward: Float[Array, "2"]  # direction of the trunk's x axis: components along the track and to its left
 
 
 def locate(body: Body, quaternion: Float[Array, "4"]) -> TrackPose:

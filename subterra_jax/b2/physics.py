@@ -29,19 +29,12 @@ BUMPERS = ((_BUMPER_X, 0.0, 0.0), (-_BUMPER_X, 0.0, 0.0))
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Physics:
-    """The compiled robot. It is compared by identity, so that bound methods can be jitted.
+    """The compiled robot. It is compared by identity, so that bound methods can be jitted."""
 
-    Attributes:
-        window: The part of the track that can be touched.
-        substeps: Steps of physics in a control period.
-        iterations: Iterations of the solver in each step.
-        ls_iterations: Iterations of its line search.
-    """
-
-    window: WindowConfig = dataclasses.field(default_factory=WindowConfig)
-    substeps: int = 5
-    iterations: int = 1
-    ls_iterations: int = 5
+    window: WindowConfig = dataclasses.field(default_factory=WindowConfig)  # the part of the track that can be touched
+    substeps: int = 5  # steps of physics in a control period
+    iterations: int = 1  # iterations of the solver in each step
+    ls_iterations: int = 5  # iterations of its line search
 
     @property
     def period(self) -> float:

@@ -25,17 +25,11 @@ _ROUNDING = 5  # sections of a rounded end
 
 @dataclasses.dataclass(frozen=True)
 class ShapePart:
-    """A closed surface in the frame of its body.
+    """A closed surface in the frame of its body."""
 
-    Attributes:
-        vertices: Vertices, m, `(v, 3)`.
-        faces: Rows of three vertices, counter-clockwise from outside, `(f, 3)`.
-        colour: Red, green, blue, 0 to 1.
-    """
-
-    vertices: Float[np.ndarray, "v 3"]
-    faces: Int[np.ndarray, "f 3"]
-    colour: Colour
+    vertices: Float[np.ndarray, "v 3"]  # vertices, m, `(v, 3)`
+    faces: Int[np.ndarray, "f 3"]  # rows of three vertices, counter-clockwise from outside, `(f, 3)`
+    colour: Colour  # Red, green, blue, 0 to 1
 
 
 Section = tuple[float, float, float, float, float]

@@ -40,32 +40,21 @@ class TrackError(SubterraError):
 
 @struct.dataclass
 class Track:
-    """Sleepers in order of station.
+    """Sleepers in order of station."""
 
-    Attributes:
-        station: Station of each sleeper, m.
-        position: Middle of each sleeper's top, tunnel frame, m.
-        quaternion: Rotation of each sleeper: x along the track, y to the left, z up, with cant and grade.
-        protrusion: Height of the sleepers above the ballast, m.
-    """
-
-    station: Float[Array, "k"]
-    position: Float[Array, "k 3"]
+    station: Float[Array, "k"]  # station of each sleeper, m
+    position: Float[Array, "k 3"]  # middle of each sleeper's top, tunnel frame, m
+    # rotation of each sleeper: x along the track, y to the left, z up, with cant and grade
     quaternion: Float[Array, "k 4"]
-    protrusion: Float[Array, ""]
+    protrusion: Float[Array, ""]  # height of the sleepers above the ballast, m
 
 
 @dataclasses.dataclass(frozen=True)
 class WindowConfig:
-    """The part of the track that can be touched.
+    """The part of the track that can be touched."""
 
-    Attributes:
-        rails: Whether there are rails.
-        max_contacts: Contacts resolved at once, the deepest first; 0 resolves all of them.
-    """
-
-    rails: bool = True
-    max_contacts: int = 8
+    rails: bool = True  # whether there are rails
+    max_contacts: int = 8  # contacts resolved at once, the deepest first; 0 resolves all of them
 
 
 def lay_standard_track(plan: TunnelPlan) -> Track:

@@ -30,35 +30,22 @@ class Lag:
 
     The defaults were identified from the released gait: 900 steps of six robots in MuJoCo, steered along the
     centreline with noisy commands.
-
-    Attributes:
-        speed: Time constant of the forward speed, s.
-        yaw_rate: Time constant of the yaw rate, s.
-        speed_gain: Final speed over a lasting command, 1.
-        yaw_rate_gain: Final yaw rate over a lasting command, 1.
     """
 
-    speed: float = 0.38
-    yaw_rate: float = 0.24
-    speed_gain: float = 1.01
-    yaw_rate_gain: float = 1.07
+    speed: float = 0.38  # time constant of the forward speed, s
+    yaw_rate: float = 0.24  # time constant of the yaw rate, s
+    speed_gain: float = 1.01  # final speed over a lasting command, 1
+    yaw_rate_gain: float = 1.07  # final yaw rate over a lasting command, 1
 
 
 @dataclasses.dataclass(frozen=True)
 class Nod:
-    """Random lean of the trunk in each step; beams that point down end on the ballast.
+    """Random lean of the trunk in each step; beams that point down end on the ballast."""
 
-    Attributes:
-        pitch: Mean pitch, nose down, rad.
-        pitch_sigma: Standard deviation of the pitch, rad.
-        roll_sigma: Standard deviation of the roll, rad.
-        height: Height of the LiDAR over the ballast, m.
-    """
-
-    pitch: float = 0.03
-    pitch_sigma: float = 0.04
-    roll_sigma: float = 0.03
-    height: float = 0.75
+    pitch: float = 0.03  # mean pitch, nose down, rad
+    pitch_sigma: float = 0.04  # standard deviation of the pitch, rad
+    roll_sigma: float = 0.03  # standard deviation of the roll, rad
+    height: float = 0.75  # height of the LiDAR over the ballast, m
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,12 +53,9 @@ class LaggedWheels(Unicycle):
     """A robot that follows its commands through two first-order lags.
 
     `State.command` is the motion of the robot, so that the reward's jerk is that of its motion.
-
-    Attributes:
-        lag: The lags.
     """
 
-    lag: Lag = Lag()
+    lag: Lag = Lag()  # the lags
 
     def obey(self, action: Float[Array, "n_action"], state: State, params: EnvParams) -> Float[Array, "2"]:
         """Follow the clipped command, late."""
@@ -83,13 +67,9 @@ class LaggedWheels(Unicycle):
 
 @dataclasses.dataclass(frozen=True)
 class NoddingLidar(PlanarLidar):
-    """A planar LiDAR that leans with the trunk: beams that point down end on the ballast.
+    """A planar LiDAR that leans with the trunk: beams that point down end on the ballast."""
 
-    Attributes:
-        nod: Lean of the trunk.
-    """
-
-    nod: Nod = Nod()
+    nod: Nod = Nod()  # lean of the trunk
 
     def normals(self, params: EnvParams) -> int:
         """One for each beam, then pitch and roll."""
@@ -121,23 +101,14 @@ def stand_in(env: TunnelEnv, lag: Lag = Lag(), nod: Nod = Nod()) -> TunnelEnv:
 
 @struct.dataclass
 class Walk:
-    """Robots on their way.
+    """Robots on their way."""
 
-    Attributes:
-        state: State of the environment.
-        over: The robot has arrived or failed.
-        success: The robot has arrived.
-        contact: The robot touched a wall.
-        fall: The robot fell.
-        steps: Steps taken.
-    """
-
-    state: State
-    over: Bool[Array, "*n"]
-    success: Bool[Array, "*n"]
-    contact: Bool[Array, "*n"]
-    fall: Bool[Array, "*n"]
-    steps: Int[Array, "*n"]
+    state: State  # state of the environment
+    over: Bool[Array, "*n"]  # the robot has arrived or failed
+    success: Bool[Array, "*n"]  # the robot has arrived
+    contact: Bool[Array, "*n"]  # the robot touched a wall
+    fall: Bool[Array, "*n"]  # the robot fell
+    steps: Int[Array, "*n"]  # steps taken
 
 
 def walk_robots(

@@ -86,7 +86,6 @@ class RobotView:
         )
 
     def close(self) -> None:
-        """Release the renderer, if there is one."""
         if "_camera" in self.__dict__:
             self._camera.close()
 

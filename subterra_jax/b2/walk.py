@@ -181,7 +181,6 @@ class WalkEnv:
         return jnp.minimum(*[clearance(params.tunnel, end[:2], station) for end in ends])
 
     def _outside(self, station: Float[Array, ""], params: WalkParams) -> Bool[Array, ""]:
-        """Tell whether a station lies beyond the ends of the track."""
         last = params.track.station.shape[0] - 1
         return (station < params.track.station[0]) | (station > params.track.station[last])
 

@@ -32,42 +32,25 @@ _IN_LANE = 0.1  # m; this near its lane it follows the axis
 
 @struct.dataclass
 class Surroundings:
-    """The corridor, and hits on boxes along it.
+    """The corridor, and hits on boxes along it."""
 
-    Attributes:
-        corridor: The walls.
-        along: Distance ahead along the axis at which each hit lies, m.
-        across: Distance to the left of the middle between the walls, m.
-        newest: Row of the newest hits.
-        lane: Lane to take, m left of the middle.
-    """
-
-    corridor: Corridor
-    along: Float[Array, "n_scans n_beams"]
-    across: Float[Array, "n_scans n_beams"]
-    newest: Int[Array, ""]
-    lane: Float[Array, ""]
+    corridor: Corridor  # the walls
+    along: Float[Array, "n_scans n_beams"]  # distance ahead along the axis at which each hit lies, m
+    across: Float[Array, "n_scans n_beams"]  # distance to the left of the middle between the walls, m
+    newest: Int[Array, ""]  # row of the newest hits
+    lane: Float[Array, ""]  # lane to take, m left of the middle
 
 
 @struct.dataclass
 class Avoidance(Steering):
-    """Takes the nearest free lane, and slows down where its own is blocked.
+    """Takes the nearest free lane, and slows down where its own is blocked."""
 
-    Attributes:
-        speed: Largest speed, m/s; a slow robot gets more hits on a box.
-        margin: Free space to keep beside the robot, m.
-        headway: Distance from the robot's middle to a box ahead at which it stands, m.
-        look_ahead: Length over which a lane must be free, m.
-        offset_gain: Angle for a distance from the lane, rad/m.
-        angle_gain: Yaw rate for an angle, 1/s.
-    """
-
-    speed: float = 1.2
-    margin: float = 0.15
-    headway: float = 0.6
-    look_ahead: float = 4.0
-    offset_gain: float = 0.8
-    angle_gain: float = 4.0
+    speed: float = 1.2  # largest speed, m/s; a slow robot gets more hits on a box
+    margin: float = 0.15  # free space to keep beside the robot, m
+    headway: float = 0.6  # distance from the robot's middle to a box ahead at which it stands, m
+    look_ahead: float = 4.0  # length over which a lane must be free, m
+    offset_gain: float = 0.8  # angle for a distance from the lane, rad/m
+    angle_gain: float = 4.0  # yaw rate for an angle, 1/s
 
     def begin(self, obs: Observed, params: EnvParams) -> Surroundings:
         nowhere = jnp.full((N_SCANS, obs.ranges.shape[0]), -1e3)

@@ -25,19 +25,12 @@ _SPIN = 0.05  # rad in a step beyond which the robot is turning round
 
 @struct.dataclass
 class OdometerNoise:
-    """Errors of an odometer that a cloud weighs apart, where its particles move by the command.
+    """Errors of an odometer that a cloud weighs apart, where its particles move by the command."""
 
-    Attributes:
-        step_sigma: Standard deviation of the noise of one step, m.
-        bias_sigma: Standard deviation of the relative error that lasts an episode, 1.
-        wander: The relative error that changes along the way.
-        turn_sigma: Standard deviation of what half a turn adds to the relative error, 1.
-    """
-
-    step_sigma: float
-    bias_sigma: float
-    wander: WanderParams
-    turn_sigma: float = 0.0
+    step_sigma: float  # standard deviation of the noise of one step, m
+    bias_sigma: float  # standard deviation of the relative error that lasts an episode, 1
+    wander: WanderParams  # the relative error that changes along the way
+    turn_sigma: float = 0.0  # standard deviation of what half a turn adds to the relative error, 1
 
     @property
     def variance(self) -> float:
@@ -47,33 +40,23 @@ class OdometerNoise:
 
 @struct.dataclass
 class CloudParams:
-    """Motion and resampling of a cloud.
+    """Motion and resampling of a cloud."""
 
-    Attributes:
-        scale_sigma: Standard deviation of the relative error of dead reckoning that lasts an episode, 1.
-        wander: The relative error that changes along the way.
-        step_sigma: Standard deviation of the noise of one step of dead reckoning, m.
-        slip_rate: Rate at which a particle changes between dry and wet rail, 1/m; 0 is never.
-        slip_loss: Share of the speed lost on wet rail, 1.
-        ess_share: The cloud is resampled when its effective size falls below this share.
-        least_share: Share to which one scan may reduce the effective size. A likelihood that would reduce it further is
-            flattened, so that chance does not select a few particles of a sparse cloud.
-        roughening: Standard deviation of the noise on the lasting scale error of a resampled particle, 1.
-        jitter: Standard deviation of the noise on its station, in lengths of the cloud over its particles.
-        cluster: Half the length of one cluster, m: half the shortest distance at which a wall repeats.
-        odometer: The odometer, where it is weighed apart; None where it is part of the dead reckoning.
-    """
-
+    # standard deviation of the relative error of dead reckoning that lasts an episode, 1
     scale_sigma: float | Float[Array, ""]
-    wander: WanderParams
-    step_sigma: float | Float[Array, ""] = 0.01
+    wander: WanderParams  # the relative error that changes along the way
+    step_sigma: float | Float[Array, ""] = 0.01  # standard deviation of the noise of one step of dead reckoning, m
+    # rate at which a particle changes between dry and wet rail, 1/m; 0 is never
     slip_rate: float | Float[Array, ""] = 0.0
-    slip_loss: float | Float[Array, ""] = 0.3
-    ess_share: float = 0.5
+    slip_loss: float | Float[Array, ""] = 0.3  # share of the speed lost on wet rail, 1
+    ess_share: float = 0.5  # the cloud is resampled when its effective size falls below this share
+    # Share to which one scan may reduce the effective size. A likelihood that would reduce it further is flattened, so
+    # that chance does not select a few particles of a sparse cloud.
     least_share: float = 0.5
-    roughening: float = 0.0005
-    jitter: float = 0.2
-    cluster: float = 0.6
+    roughening: float = 0.0005  # standard deviation of the noise on the lasting scale error of a resampled particle, 1
+    jitter: float = 0.2  # standard deviation of the noise on its station, in lengths of the cloud over its particles
+    cluster: float = 0.6  # half the length of one cluster, m: half the shortest distance at which a wall repeats
+    # the odometer, where it is weighed apart; None where it is part of the dead reckoning
     odometer: OdometerNoise | None = None
 
 
@@ -114,23 +97,15 @@ def cloud_params(params: EnvParams) -> CloudParams:
 
 @struct.dataclass
 class Cloud:
-    """Particles.
+    """Particles."""
 
-    Attributes:
-        pose: Pose of each particle.
-        scale: Lasting relative error of dead reckoning, 1.
-        wander: Changing relative error, 1.
-        wet: 1 where the particle assumes wet rail, else 0.
-        log_weight: Log of the weight; the weights sum to 1 after `reweight`.
-        odometer: Mean and variance of the odometer's relative error, given the particle's way; None where the odometer
-            is not weighed apart.
-    """
-
-    pose: TunnelPose
-    scale: Float[Array, "n"]
-    wander: Float[Array, "n"]
-    wet: Float[Array, "n"]
-    log_weight: Float[Array, "n"]
+    pose: TunnelPose  # pose of each particle
+    scale: Float[Array, "n"]  # lasting relative error of dead reckoning, 1
+    wander: Float[Array, "n"]  # changing relative error, 1
+    wet: Float[Array, "n"]  # 1 where the particle assumes wet rail, else 0
+    log_weight: Float[Array, "n"]  # log of the weight; the weights sum to 1 after `reweight`
+    # mean and variance of the odometer's relative error, given the particle's way; None where the odometer is not
+    # weighed apart
     odometer: Float[Array, "n 2"] | None = None
 
 
@@ -221,12 +196,10 @@ def reweight(cloud: Cloud, gain: Float[Array, "n"], params: CloudParams) -> Clou
 
 
 def _normalise(log_weight: Float[Array, "*m n"]) -> Float[Array, "*m n"]:
-    """Scales weights to a sum of 1."""
     return log_weight - jax.scipy.special.logsumexp(log_weight, axis=-1, keepdims=True)
 
 
 def _effective_size(log_weight: Float[Array, "*m n"]) -> Float[Array, "*m"]:
-    """Effective number of particles."""
     return 1.0 / jnp.sum(jnp.exp(2.0 * log_weight), axis=-1)
 
 

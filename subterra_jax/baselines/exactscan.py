@@ -25,40 +25,27 @@ _DOUBT = (4.0, 1.0)  # factors on the variance, pass by pass
 
 @struct.dataclass
 class ExactParams:
-    """Likelihood of a scan that was cast at a pose.
+    """Likelihood of a scan that was cast at a pose."""
 
-    Attributes:
-        lateral_sigma: Standard deviation of an offset that was fitted to the scan, m.
-        heading_sigma: Standard deviation of such a heading, rad.
-        wall_sigma: Distance of a wall from its tangent where a beam ends, m, as a standard deviation.
-        bend_sigma: What a metre of range adds to that, 1: the tangent is told by the curvature about the robot.
-        power: Exponent of the likelihood: scans have errors in common.
-        lost: Share of the echoes that are lost or false, where there are faults or boxes; elsewhere a tenth of it.
-    """
-
-    lateral_sigma: float = 0.01
-    heading_sigma: float = 0.003
-    wall_sigma: float = 0.005
+    lateral_sigma: float = 0.01  # standard deviation of an offset that was fitted to the scan, m
+    heading_sigma: float = 0.003  # standard deviation of such a heading, rad
+    wall_sigma: float = 0.005  # distance of a wall from its tangent where a beam ends, m, as a standard deviation
+    # what a metre of range adds to that, 1: the tangent is told by the curvature about the robot
     bend_sigma: float = 0.001
-    power: float = 0.5
+    power: float = 0.5  # exponent of the likelihood: scans have errors in common
+    # share of the echoes that are lost or false, where there are faults or boxes; elsewhere a tenth of it
     lost: float = 0.2
 
 
 @struct.dataclass
 class Cast:
-    """Beams that were cast in the walls.
+    """Beams that were cast in the walls."""
 
-    Attributes:
-        expected: Ranges, m.
-        slant: Sine of the angle between a beam and its wall, positive to the left; never within `_GRAZING` of 0.
-        along: Distance at which a beam ends, along that wall, m; behind is negative.
-        variance: Variance of the beam's end across that wall, m².
-    """
-
-    expected: Float[Array, "n_beams n"]
+    expected: Float[Array, "n_beams n"]  # ranges, m
+    # sine of the angle between a beam and its wall, positive to the left; never within `_GRAZING` of 0
     slant: Float[Array, "n_beams n"]
-    along: Float[Array, "n_beams n"]
-    variance: Float[Array, "n_beams n"]
+    along: Float[Array, "n_beams n"]  # distance at which a beam ends, along that wall, m; behind is negative
+    variance: Float[Array, "n_beams n"]  # variance of the beam's end across that wall, m²
 
 
 def exact_likelihood(

@@ -18,17 +18,12 @@ _FLAG_SIGMA = 0.1  # m; the flag is noticed within one step of 0.2 m
 
 @struct.dataclass
 class Belief:
-    """A normal distribution.
+    """A normal distribution."""
 
-    Attributes:
-        mean: Station (m), constant and wandering slip, constant and wandering scale error of the odometer.
-        cov: Its covariance.
-        reading: Last reading of the odometer, m.
-    """
-
+    # station (m), constant and wandering slip, constant and wandering scale error of the odometer
     mean: Float[Array, "5"]
-    cov: Float[Array, "5 5"]
-    reading: Float[Array, ""]
+    cov: Float[Array, "5 5"]  # its covariance
+    reading: Float[Array, ""]  # last reading of the odometer, m
 
 
 @struct.dataclass

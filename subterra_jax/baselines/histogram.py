@@ -67,7 +67,6 @@ def summarise(
 
 
 def _mass_within(mass: Float[Array, "ways n"], reach: Array) -> Float[Array, "ways n"]:
-    """Returns the mass within `reach` cells of each cell."""
     n = mass.shape[1]
     total = jnp.concatenate([jnp.zeros((mass.shape[0], 1)), jnp.cumsum(mass, axis=1)], axis=1)
     index = jnp.arange(n)
@@ -76,46 +75,28 @@ def _mass_within(mass: Float[Array, "ways n"], reach: Array) -> Float[Array, "wa
 
 @struct.dataclass
 class HistogramMemory:
-    """Memory of the filter.
+    """Memory of the filter."""
 
-    Attributes:
-        log_mass: Log of the belief; by direction, error of dead reckoning and cell of the tape.
-        lateral: Offset to the left of the centreline at each cell, m.
-        heading: Heading against the tangent of growing station at each cell, rad.
-        origin: Station of the tape's beginning, m.
-        way: Dead-reckoned way along the axis, m; less where the robot has turned back.
-        reckoning: Dead reckoning.
-    """
-
+    # log of the belief; by direction, error of dead reckoning and cell of the tape
     log_mass: Float[Array, "ways n_scales n"]
-    lateral: Float[Array, "ways n"]
-    heading: Float[Array, "ways n"]
-    origin: Float[Array, ""]
-    way: Float[Array, ""]
-    reckoning: Reckoning
+    lateral: Float[Array, "ways n"]  # offset to the left of the centreline at each cell, m
+    heading: Float[Array, "ways n"]  # heading against the tangent of growing station at each cell, rad
+    origin: Float[Array, ""]  # station of the tape's beginning, m
+    way: Float[Array, ""]  # dead-reckoned way along the axis, m; less where the robot has turned back
+    reckoning: Reckoning  # dead reckoning
 
 
 @struct.dataclass
 class HistogramLocaliser(Localiser):
-    """Estimates the station from dead reckoning and scans, by a belief over cells.
+    """Estimates the station from dead reckoning and scans, by a belief over cells."""
 
-    Attributes:
-        walls: The map, for offset and heading of each cell.
-        noise: Errors of dead reckoning.
-        scan: Errors of the LiDAR, for offset and heading.
-        exact: Settings of the likelihood.
-        odometer_share: Weight of the odometer against the command.
-        n_cells: Cells of the tape.
-        cell: Length of a cell, m.
-    """
-
-    walls: WallMap
-    noise: CloudParams
-    scan: ScanModel
-    odometer_share: float
-    exact: ExactParams
-    n_cells: int = struct.field(pytree_node=False, default=0)
-    cell: float = struct.field(pytree_node=False, default=CELL)
+    walls: WallMap  # the map, for offset and heading of each cell
+    noise: CloudParams  # errors of dead reckoning
+    scan: ScanModel  # errors of the LiDAR, for offset and heading
+    odometer_share: float  # weight of the odometer against the command
+    exact: ExactParams  # settings of the likelihood
+    n_cells: int = struct.field(pytree_node=False, default=0)  # cells of the tape
+    cell: float = struct.field(pytree_node=False, default=CELL)  # length of a cell, m
 
     @classmethod
     def of(cls, params: EnvParams, exact: ExactParams | None = None, cell: float = CELL) -> "HistogramLocaliser":

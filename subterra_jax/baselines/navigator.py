@@ -25,25 +25,15 @@ _MOUTH_BEAMS = (1, -1)  # the slanting beams ahead: without an echo on either si
 
 @struct.dataclass
 class Mission:
-    """Progress of an agent in its task.
+    """Progress of an agent in its task."""
 
-    Attributes:
-        direction: 1 on the way out, -1 on the way back.
-        flagged: True once the flag has been seen.
-        to_turn: Angle still to turn, rad; 0 while it drives.
-        heading: Last reading of the odometer's heading, rad.
-        stopped: True once it has arrived, or knows where it is; it then stands.
-        travelled: Distance commanded, m.
-        sure: Distance over which it has been sure of its place, m.
-    """
-
-    direction: Float[Array, ""]
-    flagged: Bool[Array, ""]
-    to_turn: Float[Array, ""]
-    heading: Float[Array, ""]
-    stopped: Bool[Array, ""]
-    travelled: Float[Array, ""]
-    sure: Float[Array, ""]
+    direction: Float[Array, ""]  # 1 on the way out, -1 on the way back
+    flagged: Bool[Array, ""]  # true once the flag has been seen
+    to_turn: Float[Array, ""]  # angle still to turn, rad; 0 while it drives
+    heading: Float[Array, ""]  # last reading of the odometer's heading, rad
+    stopped: Bool[Array, ""]  # true once it has arrived, or knows where it is; it then stands
+    travelled: Float[Array, ""]  # distance commanded, m
+    sure: Float[Array, ""]  # distance over which it has been sure of its place, m
 
 
 def start_mission(obs: Observed) -> Mission:
@@ -142,34 +132,21 @@ def turn_command(mission: Mission, params: EnvParams) -> Float[Array, "2"]:
 
 @struct.dataclass
 class Memory:
-    """Memory of a navigator.
+    """Memory of a navigator."""
 
-    Attributes:
-        steering: Memory of the steering.
-        localiser: Memory of the localiser.
-        mission: Progress in the task.
-        command: Last command, m/s and rad/s.
-    """
-
-    steering: Any
-    localiser: Any
-    mission: Mission
-    command: Float[Array, "2"]
+    steering: Any  # memory of the steering
+    localiser: Any  # memory of the localiser
+    mission: Mission  # progress in the task
+    command: Float[Array, "2"]  # last command, m/s and rad/s
 
 
 @dataclasses.dataclass(frozen=True)
 class Pace:
-    """Limits of the speed towards a goal: a slow robot has more scans of each metre.
+    """Limits of the speed towards a goal: a slow robot has more scans of each metre."""
 
-    Attributes:
-        cruise: Largest speed, m/s.
-        slow: Largest speed over the first distance, m/s.
-        learning: That first distance, m; 0 is none.
-    """
-
-    cruise: float = math.inf
-    slow: float = 0.0
-    learning: float = 0.0
+    cruise: float = math.inf  # largest speed, m/s
+    slow: float = 0.0  # largest speed over the first distance, m/s
+    learning: float = 0.0  # that first distance, m; 0 is none
 
     def limit(self, target: Float[Array, ""], travelled: Float[Array, ""]) -> Float[Array, ""]:
         """Return a target speed within the limits, m/s, after a distance commanded, m."""
@@ -181,22 +158,15 @@ class Navigator:
     """An agent that localises itself, decides how far to go, and steers there.
 
     Asked to report where it is, it drives until its map has told it; without a map it reports at once.
-
-    Attributes:
-        localiser: Estimates the station.
-        steering: Keeps between the walls.
-        name: Name on the board.
-        uses_map: The localiser needs the map.
-        sure_for: Distance over which it must be sure of its place before it reports, m.
-        pace: Limits of its speed, where it has a goal.
     """
 
-    localiser: Localiser
-    steering: Steering
-    name: str = struct.field(pytree_node=False, default="navigator")
-    uses_map: bool = struct.field(pytree_node=False, default=False)
+    localiser: Localiser  # estimates the station
+    steering: Steering  # keeps between the walls
+    name: str = struct.field(pytree_node=False, default="navigator")  # name on the board
+    uses_map: bool = struct.field(pytree_node=False, default=False)  # the localiser needs the map
+    # distance over which it must be sure of its place before it reports, m
     sure_for: float = struct.field(pytree_node=False, default=30.0)
-    pace: Pace = struct.field(pytree_node=False, default=Pace())
+    pace: Pace = struct.field(pytree_node=False, default=Pace())  # limits of its speed, where it has a goal
 
     @property
     def uses_lidar(self) -> bool:
@@ -205,7 +175,6 @@ class Navigator:
 
     @property
     def privileged(self) -> bool:
-        """True where the localiser gets the truth."""
         return self.localiser.privileged
 
     def begin(self, key: PRNGKeyArray, obs: Observed, params: EnvParams) -> Memory:

@@ -42,17 +42,11 @@ _LEAST_SIGMA = 0.01  # m
 
 @struct.dataclass
 class FilterMemory:
-    """Memory of the filter.
+    """Memory of the filter."""
 
-    Attributes:
-        cloud: The particles.
-        reckoning: Dead reckoning.
-        step: Cycles so far.
-    """
-
-    cloud: Cloud
-    reckoning: Reckoning
-    step: Int[Array, ""]
+    cloud: Cloud  # the particles
+    reckoning: Reckoning  # dead reckoning
+    step: Int[Array, ""]  # cycles so far
 
 
 @struct.dataclass
@@ -60,26 +54,18 @@ class ParticleLocaliser(Localiser):
     """Estimates the station from dead reckoning and scans, by particles.
 
     Its random numbers depend on `seed` and the step alone, so equal observations give equal estimates.
-
-    Attributes:
-        walls: The map.
-        motion: Motion of the cloud.
-        scan: Assumed errors of the LiDAR.
-        odometer_share: Weight of the odometer against the command.
-        exact: Settings of the likelihood of scans that every particle casts in the true walls; None compares the ends
-            of beams with the map.
-        seed: Seed of its random numbers.
-        n_particles: Number of particles.
-        privileged: It gets the truth, of which it reads the sizes of the episode's faults alone.
     """
 
-    walls: WallMap
-    motion: CloudParams
-    scan: ScanModel
-    odometer_share: float | Float[Array, ""]
+    walls: WallMap  # the map
+    motion: CloudParams  # motion of the cloud
+    scan: ScanModel  # assumed errors of the LiDAR
+    odometer_share: float | Float[Array, ""]  # weight of the odometer against the command
+    # settings of the likelihood of scans that every particle casts in the true walls; None compares the ends of beams
+    # with the map
     exact: ExactParams | None = None
-    seed: int = 0
-    n_particles: int = struct.field(pytree_node=False, default=256)
+    seed: int = 0  # seed of its random numbers
+    n_particles: int = struct.field(pytree_node=False, default=256)  # number of particles
+    # it gets the truth, of which it reads the sizes of the episode's faults alone
     privileged: bool = struct.field(pytree_node=False, default=False)
 
     @classmethod

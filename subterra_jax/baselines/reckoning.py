@@ -21,21 +21,13 @@ _LEAST_COMMAND, _STILL_SHARE = 0.03, 0.5  # m, 1; half of a step is five standar
 
 @struct.dataclass
 class Reckoning:
-    """Dead reckoning of one robot.
+    """Dead reckoning of one robot."""
 
-    Attributes:
-        distance: Last reading of the odometer's distance, m.
-        heading: Last reading of its heading, rad.
-        speeds: Commanded speeds of the last steps, newest first, m/s.
-        delay: Age of the observations, steps, as far as it showed when the robot set off.
-        waiting: 1 until the odometer first moves.
-    """
-
-    distance: Float[Array, ""]
-    heading: Float[Array, ""]
-    speeds: Float[Array, "5"]
-    delay: Int[Array, ""]
-    waiting: Float[Array, ""]
+    distance: Float[Array, ""]  # last reading of the odometer's distance, m
+    heading: Float[Array, ""]  # last reading of its heading, rad
+    speeds: Float[Array, "5"]  # commanded speeds of the last steps, newest first, m/s
+    delay: Int[Array, ""]  # age of the observations, steps, as far as it showed when the robot set off
+    waiting: Float[Array, ""]  # 1 until the odometer first moves
 
 
 def begin_reckoning(obs: Observed) -> Reckoning:

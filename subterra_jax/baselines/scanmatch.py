@@ -33,59 +33,35 @@ _LEAST_SIGMA = 0.01  # m
 
 @struct.dataclass
 class MatchParams:
-    """Settings of scan matching.
+    """Settings of scan matching."""
 
-    Attributes:
-        range_sigma: Standard deviation of a range, m.
-        wall_sigma: Standard deviation of one entry of the profile, m.
-        reach: Longest range used, m.
-        lateral_sigma: Standard deviation of the offset after one step of dead reckoning, m.
-        heading_sigma: Standard deviation of the heading, rad.
-        bend_sigma: Standard deviation of the curvature of the axis, 1/m.
-        width_gain: Share of a change of width that one scan contributes, 1.
-        least_age: Least distance to the station from which an entry was seen for it to be matched, m.
-        least_information: Curvature of the cost below which a match is not used, 1/m².
-    """
-
-    range_sigma: float | Float[Array, ""] = 0.05
-    wall_sigma: float = 0.05
-    reach: float = 9.0
-    lateral_sigma: float = 0.01
-    heading_sigma: float = 0.003
-    bend_sigma: float = 0.0002
-    width_gain: float = 0.05
-    least_age: float = 1.0
-    least_information: float = 5000.0
+    range_sigma: float | Float[Array, ""] = 0.05  # standard deviation of a range, m
+    wall_sigma: float = 0.05  # standard deviation of one entry of the profile, m
+    reach: float = 9.0  # longest range used, m
+    lateral_sigma: float = 0.01  # standard deviation of the offset after one step of dead reckoning, m
+    heading_sigma: float = 0.003  # standard deviation of the heading, rad
+    bend_sigma: float = 0.0002  # standard deviation of the curvature of the axis, 1/m
+    width_gain: float = 0.05  # share of a change of width that one scan contributes, 1
+    least_age: float = 1.0  # least distance to the station from which an entry was seen for it to be matched, m
+    least_information: float = 5000.0  # curvature of the cost below which a match is not used, 1/m²
 
 
 @struct.dataclass
 class WallProfile:
-    """Profiles of the two walls, in a ring of bins.
+    """Profiles of the two walls, in a ring of bins."""
 
-    Attributes:
-        total: Sum of the distances seen in each bin, m; left wall, right wall.
-        count: Number of distances in each bin.
-        stamp: Index along the tunnel of each bin.
-        seen_from: Station from which it was last seen, m.
-    """
-
-    total: Float[Array, "2 n_bins"]
-    count: Float[Array, "2 n_bins"]
-    stamp: Int[Array, "2 n_bins"]
-    seen_from: Float[Array, "2 n_bins"]
+    total: Float[Array, "2 n_bins"]  # sum of the distances seen in each bin, m; left wall, right wall
+    count: Float[Array, "2 n_bins"]  # number of distances in each bin
+    stamp: Int[Array, "2 n_bins"]  # index along the tunnel of each bin
+    seen_from: Float[Array, "2 n_bins"]  # station from which it was last seen, m
 
 
 @struct.dataclass
 class AxisPose(TunnelPose):
-    """Pose relative to an axis that is not known: what is known of it follows.
+    """Pose relative to an axis that is not known: what is known of it follows."""
 
-    Attributes:
-        bend: Curvature of the axis, 1/m.
-        half_width: Usual distance of a wall, m.
-    """
-
-    bend: Float[Array, ""]
-    half_width: Float[Array, ""]
+    bend: Float[Array, ""]  # curvature of the axis, 1/m
+    half_width: Float[Array, ""]  # usual distance of a wall, m
 
 
 def empty_profile() -> WallProfile:
@@ -167,17 +143,11 @@ def solve_adjustment(
 
 @struct.dataclass
 class Match:
-    """Best fit of scans to the profile.
+    """Best fit of scans to the profile."""
 
-    Attributes:
-        shift: Correction of the station, m.
-        information: Curvature of the cost along the axis, 1/m²: the inverse variance of `shift`.
-        informative: Whether the match may be used.
-    """
-
-    shift: Float[Array, ""]
-    information: Float[Array, ""]
-    informative: Bool[Array, ""]
+    shift: Float[Array, ""]  # correction of the station, m
+    information: Float[Array, ""]  # curvature of the cost along the axis, 1/m²: the inverse variance of `shift`
+    informative: Bool[Array, ""]  # whether the match may be used
 
 
 def mismatch(
@@ -229,45 +199,27 @@ def best_match(cost: Float[Array, "n_shifts"], params: MatchParams) -> Match:
 
 @struct.dataclass
 class MatchMemory:
-    """Memory of the scan matcher.
+    """Memory of the scan matcher."""
 
-    Attributes:
-        profile: The walls seen lately.
-        pose: Estimated pose.
-        scale: Relative error of dead reckoning, 1.
-        covariance: Variance of the station against the profile (m²), covariance with the scale (m), variance of the
-            scale (1).
-        sigma: Standard deviation of the station against the start, m.
-        cost: Mismatch of the scans since the last correction at each shift.
-        travelled: Distance since then, m.
-        reckoning: Dead reckoning.
-    """
-
-    profile: WallProfile
-    pose: AxisPose
-    scale: Float[Array, ""]
+    profile: WallProfile  # the walls seen lately
+    pose: AxisPose  # estimated pose
+    scale: Float[Array, ""]  # relative error of dead reckoning, 1
+    # variance of the station against the profile (m²), covariance with the scale (m), variance of the scale (1)
     covariance: Float[Array, "3"]
-    sigma: Float[Array, ""]
-    cost: Float[Array, "n_shifts"]
-    travelled: Float[Array, ""]
-    reckoning: Reckoning
+    sigma: Float[Array, ""]  # standard deviation of the station against the start, m
+    cost: Float[Array, "n_shifts"]  # mismatch of the scans since the last correction at each shift
+    travelled: Float[Array, ""]  # distance since then, m
+    reckoning: Reckoning  # dead reckoning
 
 
 @struct.dataclass
 class ScanMatcher(Localiser):
-    """Dead reckoning and scan matching in a Kalman filter of station and scale.
+    """Dead reckoning and scan matching in a Kalman filter of station and scale."""
 
-    Attributes:
-        motion: Errors of dead reckoning.
-        params: Settings of scan matching.
-        odometer_share: Weight of the odometer against the command.
-        window: Distance over which mismatch is summed before a correction, m.
-    """
-
-    motion: CloudParams
-    params: MatchParams
-    odometer_share: float | Float[Array, ""]
-    window: float = 5.0
+    motion: CloudParams  # errors of dead reckoning
+    params: MatchParams  # settings of scan matching
+    odometer_share: float | Float[Array, ""]  # weight of the odometer against the command
+    window: float = 5.0  # distance over which mismatch is summed before a correction, m
 
     @classmethod
     def of(cls, params: EnvParams) -> "ScanMatcher":

@@ -20,46 +20,30 @@ _ROUGH_INFLATIONS = (10.0, 6.0, 3.0, 1.5, 1.0)
 
 @struct.dataclass
 class ScanModel:
-    """Assumed errors of the LiDAR and of its map.
+    """Assumed errors of the LiDAR and of its map."""
 
-    Attributes:
-        range_sigma: Standard deviation of a range, m.
-        map_sigma: Standard deviation of the mapped walls, m, for a beam square to them; a slanting beam meets more of
-            what the map leaves out, such as the far end of a pocket instead of its back.
-        outlier_share: Share of the beams that meet something outside the map: dust, a box.
-        outlier_density: Density of the residuals of such beams, 1/m.
-        miss_share: Share of the beams that get no echo from a near wall.
-        reach: Longest range used, m: longer beams graze the wall. The same beams are used for every pose, or poses
-            would be compared by how many beams they leave out.
-        lateral_sigma: Standard deviation of the lateral offset after one step of dead reckoning, m.
-        heading_sigma: Standard deviation of the heading after one step, rad.
-        power: Exponent of the likelihood; below 1 it allows for errors that beams and scans have in common.
-    """
-
-    range_sigma: float | Float[Array, ""] = 0.05
+    range_sigma: float | Float[Array, ""] = 0.05  # standard deviation of a range, m
+    # standard deviation of the mapped walls, m, for a beam square to them; a slanting beam meets more of what the map
+    # leaves out, such as the far end of a pocket instead of its back
     map_sigma: float = 0.01
-    outlier_share: float = 0.05
-    outlier_density: float = 0.1
-    miss_share: float = 0.02
+    outlier_share: float = 0.05  # share of the beams that meet something outside the map: dust, a box
+    outlier_density: float = 0.1  # density of the residuals of such beams, 1/m
+    miss_share: float = 0.02  # share of the beams that get no echo from a near wall
+    # Longest range used, m: longer beams graze the wall. The same beams are used for every pose, or poses would be
+    # compared by how many beams they leave out.
     reach: float = 9.0
-    lateral_sigma: float = 0.01
-    heading_sigma: float = 0.003
-    power: float = 0.5
+    lateral_sigma: float = 0.01  # standard deviation of the lateral offset after one step of dead reckoning, m
+    heading_sigma: float = 0.003  # standard deviation of the heading after one step, rad
+    power: float = 0.5  # exponent of the likelihood; below 1 it allows for errors that beams and scans have in common
 
 
 @struct.dataclass
 class TunnelPose:
-    """Poses in a tunnel.
+    """Poses in a tunnel."""
 
-    Attributes:
-        station: Station, m.
-        lateral: Distance to the left of the centreline, m.
-        heading: Heading against the tangent of growing station, rad; any number of turns.
-    """
-
-    station: Float[Array, "*n"]
-    lateral: Float[Array, "*n"]
-    heading: Float[Array, "*n"]
+    station: Float[Array, "*n"]  # station, m
+    lateral: Float[Array, "*n"]  # distance to the left of the centreline, m
+    heading: Float[Array, "*n"]  # heading against the tangent of growing station, rad; any number of turns
 
 
 _Pose = TypeVar("_Pose", bound=TunnelPose)
@@ -89,22 +73,15 @@ def move_pose(
 
 @struct.dataclass
 class Endpoints:
-    """Ends of the beams of a scan.
+    """Ends of the beams of a scan."""
 
-    Attributes:
-        along: Distance ahead of the LiDAR along the tangent at its station, m.
-        station: Station, m.
-        lateral: Distance to the left of the centreline, m.
-        sigma: Standard deviation of `lateral` against the map, m, without the spread of the map itself.
-        useful: Whether the beam met something near and is used.
-        missed: Whether a beam that should meet a near wall got no echo; it ends at the usual distance of a wall.
-    """
-
-    along: Float[Array, "n_beams *n"]
-    station: Float[Array, "n_beams *n"]
-    lateral: Float[Array, "n_beams *n"]
+    along: Float[Array, "n_beams *n"]  # distance ahead of the LiDAR along the tangent at its station, m
+    station: Float[Array, "n_beams *n"]  # station, m
+    lateral: Float[Array, "n_beams *n"]  # distance to the left of the centreline, m
+    # standard deviation of `lateral` against the map, m, without the spread of the map itself
     sigma: Float[Array, "n_beams *n"]
-    useful: Bool[Array, "n_beams *n"]
+    useful: Bool[Array, "n_beams *n"]  # whether the beam met something near and is used
+    # whether a beam that should meet a near wall got no echo; it ends at the usual distance of a wall
     missed: Bool[Array, "n_beams *n"]
 
 

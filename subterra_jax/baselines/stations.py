@@ -61,36 +61,22 @@ def believed_start(obs: Observed, params: EnvParams) -> tuple[Float[Array, ""], 
 
 @struct.dataclass
 class Station:
-    """Estimate of the station.
+    """Estimate of the station."""
 
-    Attributes:
-        station: Estimated station, m.
-        log_sigma: Log of its standard deviation in m.
-        direction: 1 where the robot faces growing stations, else -1.
-    """
-
-    station: Float[Array, ""]
-    log_sigma: Float[Array, ""]
-    direction: Float[Array, ""]
+    station: Float[Array, ""]  # estimated station, m
+    log_sigma: Float[Array, ""]  # log of its standard deviation in m
+    direction: Float[Array, ""]  # 1 where the robot faces growing stations, else -1
 
 
 @struct.dataclass
 class Driven:
-    """Motion since the last estimate.
+    """Motion since the last estimate."""
 
-    Attributes:
-        speed: Commanded speed, m/s; 0 before the first command.
-        cosine: Cosine of the angle between heading and axis, by the steering.
-        direction: 1 on the way out, -1 on the way back.
-        flagged: True where the flag has just been raised: the goal is `flag_reach` away.
-        walls: Memory of the steering: the walls that it tracks.
-    """
-
-    speed: Float[Array, ""]
-    cosine: Float[Array, ""]
-    direction: Float[Array, ""]
-    flagged: Bool[Array, ""]
-    walls: Any = None
+    speed: Float[Array, ""]  # commanded speed, m/s; 0 before the first command
+    cosine: Float[Array, ""]  # cosine of the angle between heading and axis, by the steering
+    direction: Float[Array, ""]  # 1 on the way out, -1 on the way back
+    flagged: Bool[Array, ""]  # true where the flag has just been raised: the goal is `flag_reach` away
+    walls: Any = None  # memory of the steering: the walls that it tracks
 
 
 class Localiser(Protocol):
@@ -112,21 +98,13 @@ class Localiser(Protocol):
 
 @struct.dataclass
 class Count:
-    """Memory of a localiser that sums distances.
+    """Memory of a localiser that sums distances."""
 
-    Attributes:
-        station: Estimated station, m.
-        start_sigma: Standard deviation of the station of the start, m.
-        distance: Summed distance, m.
-        steps: Number of steps.
-        reading: Last reading of the odometer, m.
-    """
-
-    station: Float[Array, ""]
-    start_sigma: Float[Array, ""]
-    distance: Float[Array, ""]
-    steps: Float[Array, ""]
-    reading: Float[Array, ""]
+    station: Float[Array, ""]  # estimated station, m
+    start_sigma: Float[Array, ""]  # standard deviation of the station of the start, m
+    distance: Float[Array, ""]  # summed distance, m
+    steps: Float[Array, ""]  # number of steps
+    reading: Float[Array, ""]  # last reading of the odometer, m
 
 
 @struct.dataclass

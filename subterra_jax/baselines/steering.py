@@ -20,17 +20,11 @@ _ECHO = 1e-3  # m below `range_max`: no echo
 
 @struct.dataclass
 class Corridor:
-    """Position between the walls. It is tracked from scan to scan, so that some beams may fail.
+    """Position between the walls. It is tracked from scan to scan, so that some beams may fail."""
 
-    Attributes:
-        left: Distance to the wall on the robot's left, m.
-        right: Distance to the wall on its right, m.
-        angle: Heading less the direction of travel along the axis, rad.
-    """
-
-    left: Float[Array, ""]
-    right: Float[Array, ""]
-    angle: Float[Array, ""]
+    left: Float[Array, ""]  # distance to the wall on the robot's left, m
+    right: Float[Array, ""]  # distance to the wall on its right, m
+    angle: Float[Array, ""]  # heading less the direction of travel along the axis, rad
 
     @property
     def offset(self) -> Float[Array, ""]:
@@ -126,15 +120,10 @@ class Steering(Protocol):
 
 @struct.dataclass
 class CentreLine(Steering):
-    """PD controller of offset and angle between the walls.
+    """PD controller of offset and angle between the walls."""
 
-    Attributes:
-        offset_gain: Yaw rate for an offset, rad/s for each metre.
-        angle_gain: Yaw rate for an angle, 1/s.
-    """
-
-    offset_gain: float = 0.8
-    angle_gain: float = 2.0
+    offset_gain: float = 0.8  # yaw rate for an offset, rad/s for each metre
+    angle_gain: float = 2.0  # yaw rate for an angle, 1/s
 
     def begin(self, obs: Observed, params: EnvParams) -> Corridor:
         return find_walls(obs.ranges, params)

@@ -19,32 +19,22 @@ _ROWS = 2048  # vertices looked up at once
 
 @struct.dataclass
 class WallMap:
-    """Walls and centreline of one tunnel, or of the tunnels of a stack one after another.
+    """Walls and centreline of one tunnel, or of the tunnels of a stack one after another."""
 
-    Attributes:
-        wall: Distance of the left and of the right wall from the centreline in each cell of station, m: the first
-            surface going outward, averaged over the blur of a range.
-        spread: Variance of that distance within the blur, m²: large where a pocket begins.
-        bend: Curvature of the centreline ahead, behind and at each node, 1/m; positive to the left.
-        half_width: Usual distance of a wall, m.
-        cell: Length of a cell of station, m.
-        spacing: Length between nodes of the centreline, m. It and the next four are `(k,)` for a stack of k.
-        first_cell: First cell of each tunnel.
-        n_cells: Cells of each tunnel.
-        first_node: First node of each tunnel.
-        n_nodes: Nodes of each tunnel.
-    """
-
+    # distance of the left and of the right wall from the centreline in each cell of station, m: the first surface going
+    # outward, averaged over the blur of a range
     wall: Float[Array, "2 all_cells"]
-    spread: Float[Array, "2 all_cells"]
+    spread: Float[Array, "2 all_cells"]  # variance of that distance within the blur, m²: large where a pocket begins
+    # curvature of the centreline ahead, behind and at each node, 1/m; positive to the left
     bend: Float[Array, "3 all_nodes"]
-    half_width: Float[Array, ""]
-    cell: Float[Array, ""]
+    half_width: Float[Array, ""]  # usual distance of a wall, m
+    cell: Float[Array, ""]  # length of a cell of station, m
+    # Length between nodes of the centreline, m. It and the next four are `(k,)` for a stack of k.
     spacing: Float[Array, "k"]
-    first_cell: Int[Array, "k"]
-    n_cells: Int[Array, "k"]
-    first_node: Int[Array, "k"]
-    n_nodes: Int[Array, "k"]
+    first_cell: Int[Array, "k"]  # first cell of each tunnel
+    n_cells: Int[Array, "k"]  # cells of each tunnel
+    first_node: Int[Array, "k"]  # first node of each tunnel
+    n_nodes: Int[Array, "k"]  # nodes of each tunnel
 
     def pick(self, tunnel: Tunnel) -> "WallMap":
         """Picks the map of one tunnel, found by its first node; fields of `(k,)` become scalars."""
@@ -140,7 +130,6 @@ def _tunnel_coordinates(segment: np.ndarray, grid: np.ndarray, spacing: float) -
 
 
 def _nearest(points: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    """Index of the node nearest to each point."""
     squared = (points[:, None, 0] - grid[None, :, 0]) ** 2 + (points[:, None, 1] - grid[None, :, 1]) ** 2
     return np.argmin(squared, axis=1)
 

@@ -25,19 +25,12 @@ class EvaluationError(SubterraError):
 
 @dataclasses.dataclass(frozen=True)
 class Episodes:
-    """Episodes to drive. Everything random in an episode comes from its seed alone.
+    """Episodes to drive. Everything random in an episode comes from its seed alone."""
 
-    Attributes:
-        seed: Seeds, `(n,)`.
-        tunnel: Number of the tunnel in a stack, `(n,)`; 0 where there is one.
-        severity: Severity of the faults, `(n,)`; 0 where there are none.
-        group: Stratum of the bootstrap, `(n,)`.
-    """
-
-    seed: np.ndarray
-    tunnel: np.ndarray
-    severity: np.ndarray
-    group: np.ndarray
+    seed: np.ndarray  # seeds, `(n,)`
+    tunnel: np.ndarray  # number of the tunnel in a stack, `(n,)`; 0 where there is one
+    severity: np.ndarray  # severity of the faults, `(n,)`; 0 where there are none
+    group: np.ndarray  # stratum of the bootstrap, `(n,)`
 
     def __len__(self) -> int:
         return len(self.seed)

@@ -167,7 +167,6 @@ class _Errors:
         return float(self.covariance[0, 0])
 
     def learn(self, row: Float[np.ndarray, "6"], noise: float) -> None:
-        """Learn `row · state` with a variance of noise."""
         spread = self.covariance @ row
         self.covariance = self.covariance - np.outer(spread, spread) / (row @ spread + noise)
 

@@ -76,7 +76,6 @@ def fitting_batch(env: TunnelEnv, params: EnvParams, agent: Agent | DrivingPolic
 
 
 def _prepare(env: TunnelEnv, params: EnvParams, agent: Agent | DrivingPolicy) -> tuple[TunnelEnv, Agent, Driver]:
-    """Return the environment, the agent and the driver of an evaluation."""
     agent = agent.agent if isinstance(agent, DrivingPolicy) else agent
     if isinstance(agent, Trained):
         check_task(agent, env, params, agent.name)

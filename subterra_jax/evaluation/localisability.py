@@ -128,15 +128,11 @@ def localisability(
 
 @dataclasses.dataclass(frozen=True)
 class _Cells:
-    """Mean of what one scan tells in each cell.
+    """Mean of what one scan tells in each cell."""
 
-    Attributes:
-        information: Fisher information about station, offset and heading, `(n, 3, 3)`.
-        told: Information about each of the three with the others unknown, `(n, 3)`. The mean is taken last: each scan
-            has an offset and a heading of its own, and the mean matrix would be that of one pose for all of a cell.
-    """
-
-    information: Float[np.ndarray, "n 3 3"]
+    information: Float[np.ndarray, "n 3 3"]  # fisher information about station, offset and heading, `(n, 3, 3)`
+    # Information about each of the three with the others unknown, `(n, 3)`. The mean is taken last: each scan has an
+    # offset and a heading of its own, and the mean matrix would be that of one pose for all of a cell.
     told: Float[np.ndarray, "n 3"]
 
 

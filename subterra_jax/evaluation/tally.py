@@ -17,62 +17,36 @@ _SLIPPED = 0.75  # of a ring: the nearest ring must be left for good before that
 
 @struct.dataclass
 class EstimateTally:
-    """Scores of an estimate of the station: running sums over the steps of an episode.
+    """Scores of an estimate of the station: running sums over the steps of an episode."""
 
-    Attributes:
-        error: Last error, estimate less truth, m.
-        square: Sum of squared errors, m².
-        crps: Sum of the continuous ranked probability scores, m.
-        nees: Sum of squared errors over claimed variances, 1.
-        unlocked: Last step after which the error was beyond the tolerance; 0 for never.
-        ring: Rings by which the estimate is off.
-        slips: Rings by which that has changed since the first estimate.
-    """
-
-    error: Float[Array, ""]
-    square: Float[Array, ""]
-    crps: Float[Array, ""]
-    nees: Float[Array, ""]
-    unlocked: Int[Array, ""]
-    ring: Float[Array, ""]
-    slips: Float[Array, ""]
+    error: Float[Array, ""]  # last error, estimate less truth, m
+    square: Float[Array, ""]  # sum of squared errors, m²
+    crps: Float[Array, ""]  # sum of the continuous ranked probability scores, m
+    nees: Float[Array, ""]  # sum of squared errors over claimed variances, 1
+    unlocked: Int[Array, ""]  # last step after which the error was beyond the tolerance; 0 for never
+    ring: Float[Array, ""]  # rings by which the estimate is off
+    slips: Float[Array, ""]  # rings by which that has changed since the first estimate
 
 
 @struct.dataclass
 class Tally:
-    """Running sums of one episode; see `records` for what they become.
+    """Running sums of one episode; see `records` for what they become."""
 
-    Attributes:
-        steps: Steps taken.
-        travelled: Distance driven, m: the sum of the chords of the control periods.
-        way: Length of the shortest way to success, m; NaN where there is no such thing.
-        offset: Sum of |d| / w.
-        lateral_square: Sum of d², m².
-        jerk: Sum of |Δv| + |Δω|, m/s and rad/s, as the reward counts it.
-        clearance: Least distance to wall or obstacle, m; beyond `CONTACT_REACH` nobody looks.
-        success: The task was achieved.
-        contact: It ended at a wall or an obstacle.
-        goal_error: Where it stood less where it should have (of what it reported less where it stood), m.
-        coverage: Share of the tunnel covered when the episode was over.
-        progress: Share covered had the robot gone on to the far mouth.
-        over: The episode is over as published; what comes after only counts as progress.
-        estimates: Scores of its estimate.
-    """
-
-    steps: Int[Array, ""]
-    travelled: Float[Array, ""]
-    way: Float[Array, ""]
-    offset: Float[Array, ""]
-    lateral_square: Float[Array, ""]
-    jerk: Float[Array, ""]
-    clearance: Float[Array, ""]
-    success: Bool[Array, ""]
-    contact: Bool[Array, ""]
+    steps: Int[Array, ""]  # steps taken
+    travelled: Float[Array, ""]  # distance driven, m: the sum of the chords of the control periods
+    way: Float[Array, ""]  # length of the shortest way to success, m; NaN where there is no such thing
+    offset: Float[Array, ""]  # sum of |d| / w
+    lateral_square: Float[Array, ""]  # sum of d², m²
+    jerk: Float[Array, ""]  # sum of |Δv| + |Δω|, m/s and rad/s, as the reward counts it
+    clearance: Float[Array, ""]  # least distance to wall or obstacle, m; beyond `CONTACT_REACH` nobody looks
+    success: Bool[Array, ""]  # the task was achieved
+    contact: Bool[Array, ""]  # it ended at a wall or an obstacle
+    # where it stood less where it should have (of what it reported less where it stood), m
     goal_error: Float[Array, ""]
-    coverage: Float[Array, ""]
-    progress: Float[Array, ""]
-    over: Bool[Array, ""]
-    estimates: EstimateTally
+    coverage: Float[Array, ""]  # share of the tunnel covered when the episode was over
+    progress: Float[Array, ""]  # share covered had the robot gone on to the far mouth
+    over: Bool[Array, ""]  # the episode is over as published; what comes after only counts as progress
+    estimates: EstimateTally  # scores of its estimate
 
 
 def start_tally(env: TunnelEnv, state: State, here: EnvParams) -> Tally:

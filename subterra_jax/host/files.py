@@ -99,7 +99,6 @@ def replace_folder(path: Path) -> Iterator[Path]:
 
 
 def _remove(path: Path) -> None:
-    """Removes a file, whatever the disk says."""
     with suppress(OSError):
         path.unlink(missing_ok=True)
 

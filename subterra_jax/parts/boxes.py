@@ -7,17 +7,11 @@ from jaxtyping import Array, Float
 
 @struct.dataclass
 class Boxes:
-    """A few boxes in the tunnel frame.
+    """A few boxes in the tunnel frame."""
 
-    Attributes:
-        centre: Middles, m; far away where there is none.
-        axis: Unit vectors along the first side.
-        half: Half sides, m, the first along `axis`.
-    """
-
-    centre: Float[Array, "n 2"]
-    axis: Float[Array, "n 2"]
-    half: Float[Array, "n 2"]
+    centre: Float[Array, "n 2"]  # middles, m; far away where there is none
+    axis: Float[Array, "n 2"]  # unit vectors along the first side
+    half: Float[Array, "n 2"]  # half sides, m, the first along `axis`
 
 
 def distance_along(
@@ -46,7 +40,6 @@ def distance_to(boxes: Boxes, position: Float[Array, "2"]) -> Float[Array, ""]:
 
 
 def _in_frame(boxes: Boxes, vector: Float[Array, "n 2"]) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
-    """Return the components of vectors along and across the boxes."""
     axis_x, axis_y = boxes.axis[:, 0], boxes.axis[:, 1]
     return vector[:, 0] * axis_x + vector[:, 1] * axis_y, vector[:, 1] * axis_x - vector[:, 0] * axis_y
 

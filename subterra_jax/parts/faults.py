@@ -67,30 +67,19 @@ class FaultParams:
 
 @struct.dataclass
 class FaultState:
-    """Faults of one episode.
+    """Faults of one episode."""
 
-    Attributes:
-        severity: 0 to 4.
-        seed: Seed of the wet patches.
-        seen: Position x, y (m), heading (rad), station (m) and odometer readings (m, rad) of the last steps, newest
-            first. The observation shows one of them.
-        dropout_left: Steps until the lost sector is back.
-        dropout_first: First beam of that sector.
-        dropout_count: Beams of that sector.
-        freeze_left: Steps until the odometer counts again.
-        scale: Factors on the middles of `SIZES`, 1.
-        origin: Readings of the odometer at the start, m and rad.
-    """
-
-    severity: Float[Array, ""]
-    seed: UInt32[Array, ""]
+    severity: Float[Array, ""]  # 0 to 4
+    seed: UInt32[Array, ""]  # seed of the wet patches
+    # Position x, y (m), heading (rad), station (m) and odometer readings (m, rad) of the last steps, newest first. The
+    # observation shows one of them.
     seen: Float[Array, "5 6"]
-    dropout_left: Float[Array, ""]
-    dropout_first: Float[Array, ""]
-    dropout_count: Float[Array, ""]
-    freeze_left: Float[Array, ""]
-    scale: Float[Array, "7"]
-    origin: Float[Array, "2"]
+    dropout_left: Float[Array, ""]  # steps until the lost sector is back
+    dropout_first: Float[Array, ""]  # first beam of that sector
+    dropout_count: Float[Array, ""]  # beams of that sector
+    freeze_left: Float[Array, ""]  # steps until the odometer counts again
+    scale: Float[Array, "7"]  # factors on the middles of `SIZES`, 1
+    origin: Float[Array, "2"]  # readings of the odometer at the start, m and rad
 
 
 def sight(

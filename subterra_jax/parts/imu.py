@@ -43,20 +43,13 @@ class ImuParams:
 
 @struct.dataclass
 class ImuState:
-    """Samples of the last step, and what the next ones go on from.
+    """Samples of the last step, and what the next ones go on from."""
 
-    Attributes:
-        samples: Specific force along the robot's axes ahead, left and up (m/s²) and turn rate about them (rad/s),
-            oldest first.
-        velocity: Mean velocity in the last sample's interval, tunnel frame, m/s.
-        axes: Axes ahead, left and up at its end, as rows, tunnel frame.
-        bias: Present bias, as a sample.
-    """
-
+    # specific force along the robot's axes ahead, left and up (m/s²) and turn rate about them (rad/s), oldest first
     samples: Float[Array, "n 6"]
-    velocity: Float[Array, "3"]
-    axes: Float[Array, "3 3"]
-    bias: Float[Array, "6"]
+    velocity: Float[Array, "3"]  # mean velocity in the last sample's interval, tunnel frame, m/s
+    axes: Float[Array, "3 3"]  # axes ahead, left and up at its end, as rows, tunnel frame
+    bias: Float[Array, "6"]  # present bias, as a sample
 
 
 def measure(
@@ -110,7 +103,6 @@ class Imu(Part):
         return ImuState(jnp.repeat(rest, params.imu.samples, axis=0) + bias, jnp.zeros(3), axes, bias)
 
     def advance(self, own: ImuState, step: Step, noise: Noise, params: EnvParams) -> ImuState:
-        """Measure the arc of a step."""
         n, period, sensor = params.imu.samples, jnp.asarray(params.vehicle.period), params.imu
         interval = period / n
         speed, rate = step.drive.motion[0], step.drive.motion[1]
@@ -154,7 +146,6 @@ class Imu(Part):
 
 
 def _sizes(accel: Any, gyro: Any) -> Float[Array, "6"]:
-    """Return one size for the three axes of each sensor."""
     return jnp.concatenate([jnp.full(3, accel), jnp.full(3, gyro)])
 
 
@@ -163,7 +154,6 @@ def _not_zero(value: Array) -> Array:
 
 
 def _axes(tunnel: Any, station: Array, heading: Array) -> Float[Array, "3 3"]:
-    """Return the robot's axes on the ground."""
     _, rise = ground_at(tunnel, station)
     _, _, tangent_x, tangent_y, _ = at_station(tunnel, station)
     return jnp.stack([jnp.stack(axis) for axis in level_axes(rise, tangent_x, tangent_y, heading)])

@@ -97,15 +97,10 @@ def clearance(
 
 @struct.dataclass
 class ObstacleState:
-    """Boxes of an episode.
+    """Boxes of an episode."""
 
-    Attributes:
-        seed: Seed of the boxes.
-        start: Station of the start, m.
-    """
-
-    seed: UInt32[Array, ""]
-    start: Float[Array, ""]
+    seed: UInt32[Array, ""]  # seed of the boxes
+    start: Float[Array, ""]  # station of the start, m
 
 
 @dataclasses.dataclass(frozen=True)

@@ -51,22 +51,15 @@ class OdometryParams:
 
 @struct.dataclass
 class OdometryState:
-    """Readings of the odometer, and its errors in this episode.
+    """Readings of the odometer, and its errors in this episode."""
 
-    Attributes:
-        distance: Dead-reckoned distance travelled, m; may fall when the noise exceeds the motion.
-        heading: Dead-reckoned heading since the start, rad, in [-π, π].
-        distance_bias: Relative error of distance, 1.
-        heading_bias: Error of the yaw rate, rad/s.
-        wander: Relative error of distance at present, on top of the bias, 1; None without one.
-        backward_bias: Relative error of distance that is added while facing falling stations, 1; None without one.
-    """
-
-    distance: Float[Array, ""]
-    heading: Float[Array, ""]
-    distance_bias: Float[Array, ""]
-    heading_bias: Float[Array, ""]
+    distance: Float[Array, ""]  # dead-reckoned distance travelled, m; may fall when the noise exceeds the motion
+    heading: Float[Array, ""]  # dead-reckoned heading since the start, rad, in [-π, π]
+    distance_bias: Float[Array, ""]  # relative error of distance, 1
+    heading_bias: Float[Array, ""]  # error of the yaw rate, rad/s
+    # relative error of distance at present, on top of the bias, 1; None without one
     wander: Float[Array, ""] | None = None
+    # relative error of distance that is added while facing falling stations, 1; None without one
     backward_bias: Float[Array, ""] | None = None
 
 

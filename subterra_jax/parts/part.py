@@ -42,40 +42,24 @@ class Noise:
 
 @dataclasses.dataclass(frozen=True)
 class Drive:
-    """Motion of one step, between the command and the ground.
+    """Motion of one step, between the command and the ground."""
 
-    Attributes:
-        wheels: Speed (m/s) and yaw rate (rad/s) of the wheels, which the odometer counts.
-        motion: Speed and yaw rate of the robot itself.
-    """
-
-    wheels: Float[Array, 2]
-    motion: Float[Array, 2]
+    wheels: Float[Array, 2]  # speed (m/s) and yaw rate (rad/s) of the wheels, which the odometer counts
+    motion: Float[Array, 2]  # speed and yaw rate of the robot itself
 
 
 @dataclasses.dataclass(frozen=True)
 class Moved:
-    """Result of a motion.
+    """Result of a motion."""
 
-    Attributes:
-        position: Position afterwards, tunnel frame, m.
-        heading: Heading afterwards, rad, in [-π, π].
-        drive: Mean motion during the step.
-        own: State of the motion part afterwards.
-        clearance: Least distance to a wall during the step, m; read only where the motion is not `on_the_plan`.
-        contact: The motion itself met an obstacle.
-        fallen: The robot can go on no further; ends the episode.
-        info: Further entries of `info`.
-    """
-
-    position: Float[Array, 2]
-    heading: Float[Array, ""]
-    drive: Drive
-    own: Any
-    clearance: Any
-    contact: Any
-    fallen: Any
-    info: dict[str, Array]
+    position: Float[Array, 2]  # position afterwards, tunnel frame, m
+    heading: Float[Array, ""]  # heading afterwards, rad, in [-π, π]
+    drive: Drive  # mean motion during the step
+    own: Any  # state of the motion part afterwards
+    clearance: Any  # least distance to a wall during the step, m; read only where the motion is not `on_the_plan`
+    contact: Any  # the motion itself met an obstacle
+    fallen: Any  # the robot can go on no further; ends the episode
+    info: dict[str, Array]  # further entries of `info`
 
 
 @dataclasses.dataclass(frozen=True)

@@ -31,17 +31,11 @@ class SlipParams:
 
 @struct.dataclass
 class SlipState:
-    """The slip of one episode.
+    """The slip of one episode."""
 
-    Attributes:
-        gain: Relative error of the speed, 1.
-        yaw: Error of the yaw rate, rad/s.
-        wander: Relative error of the speed at present, on top of `gain`, 1.
-    """
-
-    gain: Float[Array, ""]
-    yaw: Float[Array, ""]
-    wander: Float[Array, ""]
+    gain: Float[Array, ""]  # relative error of the speed, 1
+    yaw: Float[Array, ""]  # error of the yaw rate, rad/s
+    wander: Float[Array, ""]  # relative error of the speed at present, on top of `gain`, 1
 
 
 def start_slip(noise: Float[Array, "3"], params: SlipParams) -> SlipState:

@@ -158,15 +158,10 @@ _MADE = {"spin16x64": _spin16x64, "vlp16": _vlp16, "os1-64": _os1, "avia": _avia
 
 @struct.dataclass
 class Sweeping:
-    """Pose at the beginning of the present sweep.
+    """Pose at the beginning of the present sweep."""
 
-    Attributes:
-        position: Position, tunnel frame, m.
-        heading: Heading, rad.
-    """
-
-    position: Float[Array, "2"]
-    heading: Float[Array, ""]
+    position: Float[Array, "2"]  # position, tunnel frame, m
+    heading: Float[Array, ""]  # heading, rad
 
 
 def along_arc(
@@ -204,7 +199,6 @@ class SpatialLidar(Part):
     place: ClassVar[int] = 0
 
     def defaults(self) -> dict[str, Any]:
-        """Return `lidar`."""
         return {"lidar": make_sensor("spin16x64")}
 
     def normals(self, params: EnvParams) -> int:
@@ -242,7 +236,6 @@ class SpatialLidar(Part):
         return places, turned
 
     def relief(self, sight: Sight, params: EnvParams) -> Relief:
-        """Return the surface that is seen."""
         del params
         return sight.tunnel.space.relief
 
@@ -308,7 +301,6 @@ class SpatialLidar(Part):
         return entries
 
     def images(self, params: EnvParams) -> dict[str, tuple[int, int]]:
-        """Return the shapes of the entries that are images."""
         return {name: params.lidar.shape for name in self.space(params)}
 
     def check(self, others: frozenset[str], params: EnvParams) -> None:

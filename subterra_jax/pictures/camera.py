@@ -21,16 +21,11 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class TunnelChoice:
-    """The tunnels of an environment by number.
+    """The tunnels of an environment by number."""
 
-    Attributes:
-        tunnel: As for `subterra_jax.make`.
-        lining: As for `subterra_jax.make`.
-        piece: Start and length of the piece that the task cuts out, m; `None` for the whole.
-    """
-
-    tunnel: Source | Sequence[Source] = None
-    lining: str | None = None
+    tunnel: Source | Sequence[Source] = None  # as for `subterra_jax.make`
+    lining: str | None = None  # as for `subterra_jax.make`
+    # start and length of the piece that the task cuts out, m; `None` for the whole
     piece: tuple[float, float] | None = None
 
     def plan(self, number: int) -> TunnelPlan:
@@ -146,7 +141,6 @@ class FollowCamera:
         return self._renderer.render().copy()
 
     def close(self) -> None:
-        """Release the renderer, if there is one."""
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None

@@ -23,19 +23,12 @@ _DARK = 0.05  # grey of what lies beyond the fog
 
 @dataclasses.dataclass(frozen=True)
 class Piece:
-    """A piece of a tunnel.
+    """A piece of a tunnel."""
 
-    Attributes:
-        plan: The tunnel.
-        lining: Variant of its walls.
-        start: First station, m.
-        end: Last station, m.
-    """
-
-    plan: TunnelPlan
-    lining: str | None
-    start: float
-    end: float
+    plan: TunnelPlan  # the tunnel
+    lining: str | None  # variant of its walls
+    start: float  # first station, m
+    end: float  # last station, m
 
     @classmethod
     def around(cls, plan: TunnelPlan, lining: str | None, station: float, facing: float = 1.0) -> Piece:

@@ -23,19 +23,13 @@ _THIN = 0.06  # m; a part of the track whose half width is less is a rail
 
 @dataclasses.dataclass(frozen=True)
 class Surface:
-    """A surface of one colour.
+    """A surface of one colour."""
 
-    Attributes:
-        name: Name: `wall`, `recess`, `floor`, `rail`, `sleeper` or `furniture`.
-        triangles: Vertices in the tunnel frame, m, and faces.
-        colour: Red, green, blue, 0 to 1.
-        rolled: Place of each vertex on the wall rolled out flat, or on the floor, m, `(v, 2)`, for a texture; `None`
-            where there is none.
-    """
-
-    name: str
-    triangles: Triangles
-    colour: Colour
+    name: str  # name: `wall`, `recess`, `floor`, `rail`, `sleeper` or `furniture`
+    triangles: Triangles  # vertices in the tunnel frame, m, and faces
+    colour: Colour  # Red, green, blue, 0 to 1
+    # place of each vertex on the wall rolled out flat, or on the floor, m, `(v, 2)`, for a texture; `None` where there
+    # is none
     rolled: Float[np.ndarray, "v 2"] | None = None
 
 

@@ -84,7 +84,6 @@ class TopView:
     """The plan from above: walls, boxes, the goal, the beams and the robot. Needs no GL."""
 
     def picture(self, env: TunnelEnv, params: EnvParams, state: State, obs: np.ndarray) -> np.ndarray:
-        """See `View`."""
         tunnel, fields = params.tunnel.pick(int(state.tunnel)), env.fields(params)
         goal = float(obs[fields["goal"]][0]) if "goal" in fields else None
         return top_down(
@@ -175,7 +174,6 @@ class MujocoView:
         return type(self), (self._scene, self._choice)
 
     def close(self) -> None:
-        """Release the renderer."""
         self._camera.close()
 
 

@@ -35,25 +35,16 @@ class PolicyError(SubterraError):
 
 @dataclass(frozen=True)
 class Conditions:
-    """Conditions that a policy was trained under; it drives under no others.
+    """Conditions that a policy was trained under; it drives under no others."""
 
-    Attributes:
-        task: Task id.
-        period: Control period, s.
-        n_beams: Beams of a scan; None: unknown.
-        fields: Names of the parts of the observation, in order; None: unknown.
-        constants: Digest of the benchmark's constants; None: unknown.
-    """
-
-    task: str
-    period: float
-    n_beams: int | None = None
-    fields: tuple[str, ...] | None = None
-    constants: str | None = None
+    task: str  # task id
+    period: float  # control period, s
+    n_beams: int | None = None  # beams of a scan; None: unknown
+    fields: tuple[str, ...] | None = None  # names of the parts of the observation, in order; None: unknown
+    constants: str | None = None  # digest of the benchmark's constants; None: unknown
 
     @classmethod
     def from_facts(cls, facts: dict[str, Any]) -> "Conditions":
-        """Reads them from the facts of a policy."""
         known = dict(facts[TRAINED_UNDER])
         fields = known.pop("fields", None)
         return cls(facts["task"], **known, fields=None if fields is None else tuple(fields))
@@ -67,17 +58,12 @@ class Conditions:
 
 @dataclass(frozen=True)
 class PolicyFile:
-    """A policy as it was read.
+    """A policy as it was read."""
 
-    Attributes:
-        path: The tensors' file, for messages.
-        facts: The JSON file: name, kind (`ppo`, `locate` or `walk`), task, layout, and where it comes from.
-        tensors: By name.
-    """
-
-    path: str
+    path: str  # the tensors' file, for messages
+    # the JSON file: name, kind (`ppo`, `locate` or `walk`), task, layout, and where it comes from
     facts: dict[str, Any]
-    tensors: dict[str, np.ndarray]
+    tensors: dict[str, np.ndarray]  # by name
 
 
 def released() -> dict[str, Traversable]:

@@ -50,17 +50,11 @@ class Policy(Protocol):
 
 @struct.dataclass
 class DrivingMemory:
-    """Memory of a `DrivingPolicy`.
+    """Memory of a `DrivingPolicy`."""
 
-    Attributes:
-        key: Source of the agent's randomness in this episode.
-        steps: Steps of the episode so far.
-        agent: Memory of the agent; its values mean nothing before the first step.
-    """
-
-    key: PRNGKeyArray
-    steps: Int[Array, "*env"]
-    agent: Any
+    key: PRNGKeyArray  # source of the agent's randomness in this episode
+    steps: Int[Array, "*env"]  # steps of the episode so far
+    agent: Any  # memory of the agent; its values mean nothing before the first step
 
 
 @struct.dataclass(eq=False)
@@ -130,7 +124,6 @@ def _begin(driver: DrivingPolicy, key: PRNGKeyArray, obs: Any, here: EnvParams) 
 
 
 def _blank(driver: DrivingPolicy, size: tuple[int, ...]) -> Any:
-    """Returns a memory of the right shapes and types."""
 
     def begin(flat: Float[Array, "n_obs"]) -> Any:
         here = in_tunnel(driver.env, driver.params, 0)

@@ -23,19 +23,12 @@ _KNOWN = LIDAR_ENTRIES | {"odometry", "goal", "ring_pitch", "start", "flag"}
 
 @struct.dataclass
 class Reckoned:
-    """Dead reckoning from one observation to the next.
+    """Dead reckoning from one observation to the next."""
 
-    Attributes:
-        command: Last command, m/s and rad/s.
-        flag: 1 once the goal's flag has been seen.
-        distance: Odometer's distance at the flag, or at the start, m.
-        heading: Odometer's heading there, rad.
-    """
-
-    command: Float[Array, "2"]
-    flag: Float[Array, ""]
-    distance: Float[Array, ""]
-    heading: Float[Array, ""]
+    command: Float[Array, "2"]  # last command, m/s and rad/s
+    flag: Float[Array, ""]  # 1 once the goal's flag has been seen
+    distance: Float[Array, ""]  # odometer's distance at the flag, or at the start, m
+    heading: Float[Array, ""]  # odometer's heading there, rad
 
 
 def begin(obs: Observed) -> Reckoned:

@@ -13,24 +13,15 @@ from subterra_jax.policies.network import Shape
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """Everything about a policy that is no weight.
+    """Everything about a policy that is no weight."""
 
-    Attributes:
-        memory: What is kept between observations.
-        shape: Sizes of the network.
-        action_low: Smallest action, m/s and rad/s.
-        action_high: Largest action, m/s and rad/s.
-        standing: Share of the largest speed by which the range of the tanh goes below 0.
-    """
-
-    memory: Memory
-    shape: Shape
-    action_low: tuple[float, ...]
-    action_high: tuple[float, ...]
-    standing: float = 0.5
+    memory: Memory  # what is kept between observations
+    shape: Shape  # sizes of the network
+    action_low: tuple[float, ...]  # smallest action, m/s and rad/s
+    action_high: tuple[float, ...]  # largest action, m/s and rad/s
+    standing: float = 0.5  # share of the largest speed by which the range of the tanh goes below 0
 
     def to_json(self) -> dict[str, Any]:
-        """Returns what `from_json` reads."""
         return dataclasses.asdict(self)
 
     @classmethod

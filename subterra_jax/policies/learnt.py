@@ -29,47 +29,32 @@ NETWORK, LOCALISER = "network", "localiser"
 
 @struct.dataclass
 class LearntMemory:
-    """Memory of a trained network.
+    """Memory of a trained network."""
 
-    Attributes:
-        kept: What it keeps between observations.
-        cell: Memory of its GRU.
-        command: Last command as obeyed, m/s and rad/s.
-    """
-
-    kept: Kept
-    cell: Float[Array, "cell"]
-    command: Float[Array, "2"]
+    kept: Kept  # what it keeps between observations
+    cell: Float[Array, "cell"]  # memory of its GRU
+    command: Float[Array, "2"]  # last command as obeyed, m/s and rad/s
 
 
 @struct.dataclass
 class Learnt(Localised):
-    """Drives by a trained network.
-
-    Attributes:
-        tensors: Weights by name, parts of the name between dots: `network.…`, and with a localiser `localiser.…`.
-        low: Smallest action, m/s and rad/s.
-        high: Largest action, m/s and rad/s.
-        layout: Memory and sizes of the network.
-        name: Name on the leaderboard.
-        conditions: Conditions of its training; None: any.
-    """
+    """Drives by a trained network."""
 
     kind: ClassVar[str] = KIND
     prefix: ClassVar[str] = f"{LOCALISER}."
-    tensors: Tensors
-    low: Float[Array, "n_action"]
-    high: Float[Array, "n_action"]
-    layout: Layout = struct.field(pytree_node=False)
+    tensors: Tensors  # weights by name, parts of the name between dots: `network.…`, and with a localiser `localiser.…`
+    low: Float[Array, "n_action"]  # smallest action, m/s and rad/s
+    high: Float[Array, "n_action"]  # largest action, m/s and rad/s
+    layout: Layout = struct.field(pytree_node=False)  # memory and sizes of the network
     map: MapStrip | HistogramLocaliser | None = None
     hides_map: bool = struct.field(pytree_node=False, default=False)
     blind: bool = struct.field(pytree_node=False, default=False)
-    name: str = struct.field(pytree_node=False, default=KIND)
+    name: str = struct.field(pytree_node=False, default=KIND)  # name on the leaderboard
+    # conditions of its training; None: any
     conditions: Conditions | None = struct.field(pytree_node=False, default=None)
 
     @classmethod
     def of_layout(cls, layout: Mapping[str, Any], **common: Any) -> "Learnt":
-        """Makes the agent of `Layout.to_json`."""
         return cls(**common, layout=Layout.from_json(layout))
 
     def try_out(self) -> None:
@@ -108,11 +93,9 @@ class Learnt(Localised):
 
     @property
     def _filters(self) -> bool:
-        """True where its memory is a filter on the map."""
         return self.layout.memory.kind == "map"
 
     def begin(self, key: PRNGKeyArray, obs: Observed, params: EnvParams) -> LearntMemory:
-        """Begins at the first observation, which `act` takes in."""
         del key
         kept = self.layout.memory.begin(obs, params, self.given)
         return LearntMemory(kept, start_memory(self.layout.shape, ()), jnp.zeros(2))

@@ -14,39 +14,28 @@ from subterra_jax.state import EnvParams
 
 
 class Localised(Trained):
-    """A trained agent whose tensors may hold a localiser.
+    """A trained agent whose tensors may hold a localiser."""
 
-    Attributes:
-        prefix: Beginning of the names of the localiser's tensors.
-        map: The map; None has none.
-        hides_map: Take no map: `with_map` changes nothing.
-        blind: Cut what the walls tell the localiser: an ablation.
-    """
-
-    prefix: ClassVar[str]
+    prefix: ClassVar[str]  # beginning of the names of the localiser's tensors
     uses_lidar = True
-    map: Any
-    hides_map: bool
-    blind: bool
+    map: Any  # the map; None has none
+    hides_map: bool  # take no map: `with_map` changes nothing
+    blind: bool  # cut what the walls tell the localiser: an ablation
 
     @property
     def uses_map(self) -> bool:
-        """True once it has a map."""
         return self.map is not None
 
     @property
     def takes_map(self) -> bool:
-        """True where it has learnt to take a map."""
         return any(name.startswith(f"{self.prefix}{memory.MAP}.") for name in self.tensors)
 
     @property
     def given(self) -> Given:
-        """Weights and map of the localiser."""
         own = part(self.tensors, self.prefix)
         return Given(nested(own) if own else None, self.map, self.blind)
 
     def localiser_shapes(self) -> Any:
-        """Returns the weights that a localiser like this one has, as shapes."""
         front = memory.front_of(part(self.tensors, self.prefix))
         return jax.eval_shape(lambda key: memory.init(front, key, self.takes_map), jax.random.key(0))
 

@@ -28,51 +28,31 @@ MEMORIES = ("none", "stack", "gru", "along", "map")
 
 @struct.dataclass
 class Located:
-    """A localiser under way.
+    """A localiser under way."""
 
-    Attributes:
-        walls: Walls beside the robot, as tracked.
-        direction: 1 on the way out, -1 on the way back.
-        localiser: Its memory.
-        station: Its estimate.
-    """
-
-    walls: Corridor
-    direction: Float[Array, ""]
-    localiser: Any
-    station: Station
+    walls: Corridor  # walls beside the robot, as tracked
+    direction: Float[Array, ""]  # 1 on the way out, -1 on the way back
+    localiser: Any  # its memory
+    station: Station  # its estimate
 
 
 @struct.dataclass
 class Kept:
-    """What is kept between two observations.
+    """What is kept between two observations."""
 
-    Attributes:
-        reckoned: Dead reckoning.
-        stack: Inputs of earlier observations, oldest first; none without a stack.
-        located: The localiser; None without one.
-        seen: Inputs of the newest observation.
-    """
-
-    reckoned: Reckoned
-    stack: Float[Array, "earlier n"]
-    located: Located | None
-    seen: Float[Array, "n"]
+    reckoned: Reckoned  # dead reckoning
+    stack: Float[Array, "earlier n"]  # inputs of earlier observations, oldest first; none without a stack
+    located: Located | None  # the localiser; None without one
+    seen: Float[Array, "n"]  # inputs of the newest observation
 
 
 @dataclasses.dataclass(frozen=True)
 class Memory:
-    """A choice of memory.
+    """A choice of memory."""
 
-    Attributes:
-        kind: One of `MEMORIES`.
-        frames: Observations in the stack, the newest included; 1 but with `stack`.
-        cell: Length of a cell of the belief, m; for `map`.
-    """
-
-    kind: str = "none"
-    frames: int = 1
-    cell: float = 0.25
+    kind: str = "none"  # one of `MEMORIES`
+    frames: int = 1  # observations in the stack, the newest included; 1 but with `stack`
+    cell: float = 0.25  # length of a cell of the belief, m; for `map`
 
     @property
     def locates(self) -> bool:
@@ -179,20 +159,14 @@ class Memory:
 
 @struct.dataclass
 class Given:
-    """What a memory is made with.
+    """What a memory is made with."""
 
-    Attributes:
-        weights: Of the learnt localiser, as `locate.memory.init` makes them; None without one.
-        map: The map as the learnt localiser takes it, or a filter on it in its place; None has none.
-        blind: Cut what the walls tell: an ablation.
-    """
-
-    weights: Any = None
+    weights: Any = None  # of the learnt localiser, as `locate.memory.init` makes them; None without one
+    # the map as the learnt localiser takes it, or a filter on it in its place; None has none
     map: MapStrip | HistogramLocaliser | None = None
-    blind: bool = struct.field(pytree_node=False, default=False)
+    blind: bool = struct.field(pytree_node=False, default=False)  # cut what the walls tell: an ablation
 
     def localiser(self, params: EnvParams) -> Any:
-        """Returns the localiser of a task."""
         if isinstance(self.map, HistogramLocaliser):
             return self.map
         locator = Locator(self.weights, self.map, self.blind)

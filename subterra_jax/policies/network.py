@@ -23,67 +23,42 @@ Weights = Any  # nested dict of arrays, as flax makes it
 
 @dataclasses.dataclass(frozen=True)
 class Shape:
-    """Sizes of a network.
+    """Sizes of a network."""
 
-    Attributes:
-        n_inputs: Numbers that it reads.
-        n_action: Numbers of an action.
-        hidden: Widths of the hidden layers of actor and critic.
-        cell: Width of the GRU; 0 has none.
-        way_at: Place in the inputs of the way to go over `inputs.FAR`, which the auxiliary head corrects; None has no
-            such head.
-        init_std: Standard deviation of the untrained policy before the tanh.
-        init_turn: The same for its second number, the yaw rate; None is `init_std`.
-        half: Compute in bfloat16; weights and outputs stay float32.
-        n_seen: Inputs that the actor sees; the critic sees all. 0 is all.
-    """
-
-    n_inputs: int
-    n_action: int
-    hidden: tuple[int, ...]
-    cell: int = 0
+    n_inputs: int  # numbers that it reads
+    n_action: int  # numbers of an action
+    hidden: tuple[int, ...]  # widths of the hidden layers of actor and critic
+    cell: int = 0  # width of the GRU; 0 has none
+    # place in the inputs of the way to go over `inputs.FAR`, which the auxiliary head corrects; None has no such head
     way_at: int | None = None
-    init_std: float = 0.5
-    half: bool = False
-    n_seen: int = 0
-    init_turn: float | None = None
+    init_std: float = 0.5  # standard deviation of the untrained policy before the tanh
+    half: bool = False  # compute in bfloat16; weights and outputs stay float32
+    n_seen: int = 0  # Inputs that the actor sees; the critic sees all. 0 is all.
+    init_turn: float | None = None  # the same for its second number, the yaw rate; None is `init_std`
 
 
 @struct.dataclass
 class Outputs:
-    """Answers of the network.
+    """Answers of the network."""
 
-    Attributes:
-        mean: Mean of the Gaussian before the tanh.
-        log_std: Log of its standard deviation.
-        value: Return to come, in units of the reward scale.
-        error: Error of the reckoned way to go, m, and log of its scale, by the auxiliary head; no numbers without one.
-    """
-
-    mean: Float[Array, "*batch action"]
-    log_std: Float[Array, "action"]
-    value: Float[Array, "*batch"]
+    mean: Float[Array, "*batch action"]  # mean of the Gaussian before the tanh
+    log_std: Float[Array, "action"]  # log of its standard deviation
+    value: Float[Array, "*batch"]  # return to come, in units of the reward scale
+    # error of the reckoned way to go, m, and log of its scale, by the auxiliary head; no numbers without one
     error: Float[Array, "*batch n"]
 
 
 class Cell(nn.Module):
-    """Gated recurrent unit whose inputs are projected for all steps at once. Source: Cho et al. 2014.
+    """Gated recurrent unit whose inputs are projected for all steps at once. Source: Cho et al. 2014."""
 
-    Attributes:
-        width: Numbers that it keeps.
-        dtype: Type that it computes with.
-    """
-
-    width: int
-    dtype: Any
+    width: int  # numbers that it keeps
+    dtype: Any  # type that it computes with
 
     def setup(self) -> None:
-        """Makes both projections."""
         self.of_input = nn.Dense(3 * self.width, dtype=self.dtype)
         self.of_memory = nn.Dense(3 * self.width, use_bias=False, dtype=self.dtype)
 
     def __call__(self, x: Float[Array, "*batch n"], memory: Float[Array, "*batch cell"]) -> Float[Array, "*batch cell"]:
-        """Returns the memory after inputs."""
         return self._turn(self.of_input(x), memory)
 
     def unroll(
@@ -113,21 +88,14 @@ def _gates(of_input: Array, of_memory: Array, memory: Array) -> Array:
 
 
 class Perceptron(nn.Module):
-    """Hidden layers and an output layer.
+    """Hidden layers and an output layer."""
 
-    Attributes:
-        widths: Widths of all layers, the output last.
-        scale: Scale of the untrained output layer.
-        dtype: Type that it computes with.
-    """
-
-    widths: tuple[int, ...]
-    scale: float
-    dtype: Any
+    widths: tuple[int, ...]  # widths of all layers, the output last
+    scale: float  # scale of the untrained output layer
+    dtype: Any  # type that it computes with
 
     @nn.compact
     def __call__(self, x: Float[Array, "*batch n"]) -> Float[Array, "*batch out"]:
-        """Returns the outputs."""
         for i, width in enumerate(self.widths[:-1]):
             kernel = nn.initializers.orthogonal(math.sqrt(2.0))
             x = nn.swish(nn.Dense(width, kernel_init=kernel, dtype=self.dtype, name=f"hidden_{i}")(x))
@@ -136,16 +104,11 @@ class Perceptron(nn.Module):
 
 
 class Network(nn.Module):
-    """Actor, critic and auxiliary head behind one optional memory.
+    """Actor, critic and auxiliary head behind one optional memory."""
 
-    Attributes:
-        shape: Its sizes.
-    """
-
-    shape: Shape
+    shape: Shape  # its sizes
 
     def setup(self) -> None:
-        """Makes the layers."""
         shape = self.shape
         dtype = jnp.bfloat16 if shape.half else jnp.float32
         self.actor = Perceptron((*shape.hidden, shape.n_action), 0.01, dtype)

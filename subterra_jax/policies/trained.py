@@ -17,23 +17,14 @@ Tensors = dict[str, Float[Array, "..."]]
 
 
 class Trained(Agent):
-    """A trained agent. One class a kind of network, a `flax.struct.dataclass`; `loading.KINDS` lists them.
+    """A trained agent. One class a kind of network, a `flax.struct.dataclass`; `loading.KINDS` lists them."""
 
-    Attributes:
-        kind: Name of the kind in a policy's facts.
-        learns_errand: It has learnt one errand, and drives no task with another.
-        tensors: Weights by name, as a policy's file holds them.
-        low: Smallest action, m/s and rad/s.
-        high: Largest action, m/s and rad/s.
-        conditions: Conditions of its training; None: any.
-    """
-
-    kind: ClassVar[str]
-    learns_errand: ClassVar[bool] = True
-    tensors: Any
-    low: Any
-    high: Any
-    conditions: Conditions | None
+    kind: ClassVar[str]  # name of the kind in a policy's facts
+    learns_errand: ClassVar[bool] = True  # it has learnt one errand, and drives no task with another
+    tensors: Any  # weights by name, as a policy's file holds them
+    low: Any  # smallest action, m/s and rad/s
+    high: Any  # largest action, m/s and rad/s
+    conditions: Conditions | None  # conditions of its training; None: any
 
     @classmethod
     @abc.abstractmethod

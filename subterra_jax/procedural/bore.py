@@ -22,41 +22,24 @@ _BETWEEN = 0.15  # least distance of two recesses, m
 
 @dataclasses.dataclass(frozen=True)
 class Bore:
-    """A drawn bore; its wall is known on `grid`, bilinear in between.
+    """A drawn bore; its wall is known on `grid`, bilinear in between."""
 
-    Attributes:
-        kind: Its kind.
-        grid: Stations and angles about the axis at half the section's height.
-        middle: Height of that axis above the floor, m.
-        shift: Lateral of the lining's middle line, m.
-        section: Design section.
-        outline: Distance of the design wall from the axis, the floor left out, m, `(m,)`.
-        layers: Relief of the wall.
-        rings: Its rings, if any.
-        pocket: Pockets of bolts: station and angle of the middle, length, width, depth, as in `ShellLining`, `(p, 5)`.
-        niche: Niches that belong to the lining, in the same form.
-        recess: Niches that are furniture, in the same form.
-        box: Boxes that belong to the lining.
-        furniture: Boxes that are furniture.
-        benches: Walkways and troughs, which are furniture.
-        mount: Place of the LiDAR.
-    """
-
-    kind: Kind
-    grid: Grid
-    middle: float
-    shift: float
-    section: Section
-    outline: Float[np.ndarray, " m"]
-    layers: list[Layer]
-    rings: Rings | None
+    kind: Kind  # its kind
+    grid: Grid  # stations and angles about the axis at half the section's height
+    middle: float  # height of that axis above the floor, m
+    shift: float  # lateral of the lining's middle line, m
+    section: Section  # design section
+    outline: Float[np.ndarray, " m"]  # distance of the design wall from the axis, the floor left out, m, `(m,)`
+    layers: list[Layer]  # relief of the wall
+    rings: Rings | None  # its rings, if any
+    # pockets of bolts: station and angle of the middle, length, width, depth, as in `ShellLining`, `(p, 5)`
     pocket: Float[np.ndarray, "p 5"]
-    niche: Float[np.ndarray, "k 5"]
-    recess: Float[np.ndarray, "r 5"]
-    box: Boxes
-    furniture: Boxes
-    benches: tuple[Bench, ...]
-    mount: Mount
+    niche: Float[np.ndarray, "k 5"]  # niches that belong to the lining, in the same form
+    recess: Float[np.ndarray, "r 5"]  # niches that are furniture, in the same form
+    box: Boxes  # boxes that belong to the lining
+    furniture: Boxes  # boxes that are furniture
+    benches: tuple[Bench, ...]  # walkways and troughs, which are furniture
+    mount: Mount  # place of the LiDAR
 
     @property
     def floor(self) -> Float[np.ndarray, " m"]:

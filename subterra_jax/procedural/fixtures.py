@@ -16,25 +16,15 @@ _APART = 0.3  # least distance of two fixtures at one wall, m
 
 @dataclasses.dataclass(frozen=True)
 class Boxes:
-    """Boxes at a wall and niches in it.
+    """Boxes at a wall and niches in it."""
 
-    Attributes:
-        start: Station where each begins, m, `(k,)`.
-        end: Station where it ends, m.
-        side: 1 at the left wall, -1 at the right.
-        out: Height out of the wall, m; below 0 it is the depth of a niche.
-        face: Lateral of its inner face without its sign, m; of a niche, of its mouth.
-        low: Lower end above the floor, m.
-        high: Upper end above the floor, m.
-    """
-
-    start: Float[np.ndarray, " k"]
-    end: Float[np.ndarray, " k"]
-    side: Float[np.ndarray, " k"]
-    out: Float[np.ndarray, " k"]
-    face: Float[np.ndarray, " k"]
-    low: Float[np.ndarray, " k"]
-    high: Float[np.ndarray, " k"]
+    start: Float[np.ndarray, " k"]  # station where each begins, m, `(k,)`
+    end: Float[np.ndarray, " k"]  # station where it ends, m
+    side: Float[np.ndarray, " k"]  # 1 at the left wall, -1 at the right
+    out: Float[np.ndarray, " k"]  # height out of the wall, m; below 0 it is the depth of a niche
+    face: Float[np.ndarray, " k"]  # lateral of its inner face without its sign, m; of a niche, of its mouth
+    low: Float[np.ndarray, " k"]  # lower end above the floor, m
+    high: Float[np.ndarray, " k"]  # upper end above the floor, m
 
     def where(self, chosen: Bool[np.ndarray, " k"]) -> Boxes:
         return Boxes(**{field.name: getattr(self, field.name)[chosen] for field in dataclasses.fields(self)})
@@ -92,7 +82,6 @@ def draw_boxes(
 
 
 def _draw_item(rng: np.random.Generator, ranges: FixtureRanges, section: Section, shift: float, length: float) -> Boxes:
-    """Draw all fixtures of one sort."""
     spacing = rng.uniform(*ranges.spacing)
     size = [float(rng.uniform(*r)) for r in (ranges.length, ranges.depth, ranges.low, ranges.high)]
     first, sign = rng.uniform(0.0, spacing), float(rng.choice([-1.0, 1.0]))

@@ -15,25 +15,15 @@ Range = tuple[float, float]
 
 @dataclasses.dataclass(frozen=True)
 class LineRanges:
-    """Ranges that centrelines are drawn from. A pair is the least and the largest value; draws are uniform unless said.
+    """Ranges that centrelines are drawn from: least and largest value; draws are uniform unless said."""
 
-    Attributes:
-        radius: Radius of a bend, m, drawn uniformly in its logarithm.
-        straight: Length between two bends, m.
-        arc: Length of constant curvature, m.
-        transition: Length of each clothoid, over which the curvature changes evenly, m.
-        turn: Largest turn of one bend, without its clothoids, rad.
-        reverse_share: Share of bends followed by the opposite bend without a straight.
-        grid_step: Step of the station grid, m.
-    """
-
-    radius: Range
-    straight: Range
-    arc: Range
-    transition: Range
-    turn: float
-    reverse_share: float = 0.3
-    grid_step: float = 0.25
+    radius: Range  # radius of a bend, m, drawn uniformly in its logarithm
+    straight: Range  # length between two bends, m
+    arc: Range  # length of constant curvature, m
+    transition: Range  # length of each clothoid, over which the curvature changes evenly, m
+    turn: float  # largest turn of one bend, without its clothoids, rad
+    reverse_share: float = 0.3  # share of bends followed by the opposite bend without a straight
+    grid_step: float = 0.25  # step of the station grid, m
 
 
 # Parts of a tunnel more than _ALONG apart along it stay more than _APART from one another, m: a LiDAR with a reach of
@@ -44,19 +34,13 @@ _TRIES = 200
 
 @dataclasses.dataclass(frozen=True)
 class Alignment:
-    """A centreline in plan that starts at the origin along x.
+    """A centreline in plan that starts at the origin along x."""
 
-    Attributes:
-        knot: Stations at which the curvature's slope changes, from 0, m, `(k,)`.
-        curvature: Curvature there, to the left positive, 1/m, `(k,)`; linear between, which makes clothoids.
-        length: Length of the centreline, m.
-        step: Distance of the nodes for integrating positions, m.
-    """
-
-    knot: Float[np.ndarray, " k"]
+    knot: Float[np.ndarray, " k"]  # stations at which the curvature's slope changes, from 0, m, `(k,)`
+    # curvature there, to the left positive, 1/m, `(k,)`; linear between, which makes clothoids
     curvature: Float[np.ndarray, " k"]
-    length: float
-    step: float
+    length: float  # length of the centreline, m
+    step: float  # distance of the nodes for integrating positions, m
 
     @property
     def station(self) -> Float[np.ndarray, " n"]:
@@ -141,7 +125,6 @@ def _bends(
 
 
 def _clear(alignment: Alignment) -> bool:
-    """Return whether all distant parts stay clear of one another."""
     station = np.arange(0.0, alignment.length, _SAMPLE)
     x, y = alignment.position(station).T
     apart = int(_ALONG / _SAMPLE)

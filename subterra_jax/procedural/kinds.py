@@ -27,155 +27,90 @@ Range = tuple[float, float]
 
 @dataclasses.dataclass(frozen=True)
 class SectionRanges:
-    """Outline of the section.
+    """Outline of the section."""
 
-    Attributes:
-        width: Largest inner width, m.
-        height: Height from floor to crown, m; `None` for a circle, whose invert is filled.
-        spring: Height of the springing over that of the crown, 1.
-        foot: Distance by which the walls draw in towards the floor, m.
-        fill: Depth of the invert's filling, m; for a circle.
-    """
-
-    width: Range
-    height: Range | None = None
-    spring: Range = (0.4, 0.6)
-    foot: Range = (0.0, 0.0)
-    fill: Range = (0.0, 0.0)
+    width: Range  # largest inner width, m
+    height: Range | None = None  # height from floor to crown, m; `None` for a circle, whose invert is filled
+    spring: Range = (0.4, 0.6)  # height of the springing over that of the crown, 1
+    foot: Range = (0.0, 0.0)  # distance by which the walls draw in towards the floor, m
+    fill: Range = (0.0, 0.0)  # depth of the invert's filling, m; for a circle
 
 
 @dataclasses.dataclass(frozen=True)
 class SurfaceRanges:
-    """Roughness of the wall: two Gaussian random surfaces, a fine and a coarse one.
+    """Roughness of the wall: two Gaussian random surfaces, a fine and a coarse one."""
 
-    Attributes:
-        fine_sd: Standard deviation of the fine one, m.
-        fine_length: Its correlation length, m, drawn uniformly in its logarithm.
-        coarse_sd: Standard deviation of the coarse one, m.
-        coarse_length: Its correlation length, m.
-    """
-
-    fine_sd: Range
-    fine_length: Range
-    coarse_sd: Range
-    coarse_length: Range
+    fine_sd: Range  # standard deviation of the fine one, m
+    fine_length: Range  # its correlation length, m, drawn uniformly in its logarithm
+    coarse_sd: Range  # standard deviation of the coarse one, m
+    coarse_length: Range  # its correlation length, m
 
 
 @dataclasses.dataclass(frozen=True)
 class RingRanges:
-    """Rings of segments.
+    """Rings of segments."""
 
-    Attributes:
-        nominal: Nominal ring length, m, to a centimetre.
-        gasket: Systematic excess of the built length over the nominal, 1.
-        length_sd: Standard deviation of the length of one ring, m.
-        segments: Fewest and most segments of a ring, the key among them.
-        step_sd: Standard deviation of the radial place of one segment, m; neighbours step by 1.4 times as much.
-        oval: Excess of the horizontal over the mean radius, 1.
-        turned: True for universal rings: each ring is turned to the place of its key segment.
-        dowel_share: Share of tunnels whose ring joints have dowels, which leave no pockets.
-    """
-
-    nominal: Range
-    gasket: Range
-    length_sd: float
-    segments: tuple[int, int]
-    step_sd: Range
-    oval: Range
-    turned: bool
-    dowel_share: float
+    nominal: Range  # nominal ring length, m, to a centimetre
+    gasket: Range  # systematic excess of the built length over the nominal, 1
+    length_sd: float  # standard deviation of the length of one ring, m
+    segments: tuple[int, int]  # fewest and most segments of a ring, the key among them
+    step_sd: Range  # standard deviation of the radial place of one segment, m; neighbours step by 1.4 times as much
+    oval: Range  # excess of the horizontal over the mean radius, 1
+    turned: bool  # true for universal rings: each ring is turned to the place of its key segment
+    dowel_share: float  # share of tunnels whose ring joints have dowels, which leave no pockets
 
 
 @dataclasses.dataclass(frozen=True)
 class PocketRanges:
-    """Pockets of the bolts.
+    """Pockets of the bolts."""
 
-    Attributes:
-        bolts: Fewest and most bolts around a ring joint.
-        length: Length along the tunnel, m.
-        width: Width around the section, m.
-        depth: Depth, m.
-        offset: Distance of the middle from its joint, m.
-        missing: Share of pockets that are missing or grouted flush.
-        grouted_share: Share of tunnels in which nearly all (95 %) are grouted.
-    """
-
-    bolts: tuple[int, int]
-    length: Range
-    width: Range
-    depth: Range
-    offset: Range
-    missing: Range
-    grouted_share: float
+    bolts: tuple[int, int]  # fewest and most bolts around a ring joint
+    length: Range  # length along the tunnel, m
+    width: Range  # width around the section, m
+    depth: Range  # depth, m
+    offset: Range  # distance of the middle from its joint, m
+    missing: Range  # share of pockets that are missing or grouted flush
+    grouted_share: float  # share of tunnels in which nearly all (95 %) are grouted
 
 
 @dataclasses.dataclass(frozen=True)
 class StretchRanges:
-    """Lining that is made stretch by stretch, each a little aside from the last.
+    """Lining that is made stretch by stretch, each a little aside from the last."""
 
-    Attributes:
-        length: Length of a stretch in one tunnel, m.
-        jitter: Standard deviation of one stretch's length, over that length, 1.
-        offset_sd: Standard deviation of a stretch's radial place, m, the same all around.
-        shift_sd: Standard deviation of its place aside and upright, m.
-        flare: Growth of the radius from the begin of a stretch to its end, m.
-        repaired: Share of stretches with a ring of repair inside the wall.
-        thickness: Thickness of such a ring, m.
-    """
-
-    length: Range
-    jitter: float
-    offset_sd: Range
-    shift_sd: Range
-    flare: Range = (0.0, 0.0)
-    repaired: Range = (0.0, 0.0)
-    thickness: Range = (0.0, 0.0)
+    length: Range  # length of a stretch in one tunnel, m
+    jitter: float  # standard deviation of one stretch's length, over that length, 1
+    offset_sd: Range  # standard deviation of a stretch's radial place, m, the same all around
+    shift_sd: Range  # standard deviation of its place aside and upright, m
+    flare: Range = (0.0, 0.0)  # growth of the radius from the begin of a stretch to its end, m
+    repaired: Range = (0.0, 0.0)  # share of stretches with a ring of repair inside the wall
+    thickness: Range = (0.0, 0.0)  # thickness of such a ring, m
 
 
 @dataclasses.dataclass(frozen=True)
 class PatchRanges:
-    """Patches on the wall.
+    """Patches on the wall."""
 
-    Attributes:
-        spacing: Length of tunnel for each patch, m.
-        size: Length along and around, m.
-        relief: Standard deviation of how far it stands out or in, m.
-    """
-
-    spacing: Range
-    size: Range
-    relief: Range
+    spacing: Range  # length of tunnel for each patch, m
+    size: Range  # length along and around, m
+    relief: Range  # standard deviation of how far it stands out or in, m
 
 
 @dataclasses.dataclass(frozen=True)
 class Kind:
-    """A kind of lining.
+    """A kind of lining."""
 
-    Attributes:
-        name: Name in names of tunnels.
-        title: Name in words.
-        section: Its section.
-        surface: Its roughness.
-        step: Step of the grid of stations on which the wall is known, m; a step of the wall is a ramp of this length.
-        rings: Rings of segments, if any.
-        pockets: Pockets of bolts, if any.
-        stretches: Blocks, rounds or repaired stretches, if any.
-        patches: Patches, if any.
-        fixtures: Furniture that may be drawn, by name.
-        always: Furniture that belongs to the lining itself.
-    """
-
-    name: str
-    title: str
-    section: SectionRanges
-    surface: SurfaceRanges
+    name: str  # name in names of tunnels
+    title: str  # name in words
+    section: SectionRanges  # its section
+    surface: SurfaceRanges  # its roughness
+    # step of the grid of stations on which the wall is known, m; a step of the wall is a ramp of this length
     step: float
-    rings: RingRanges | None = None
-    pockets: PocketRanges | None = None
-    stretches: StretchRanges | None = None
-    patches: PatchRanges | None = None
-    fixtures: tuple[str, ...] = ()
-    always: tuple[str, ...] = ()
+    rings: RingRanges | None = None  # rings of segments, if any
+    pockets: PocketRanges | None = None  # pockets of bolts, if any
+    stretches: StretchRanges | None = None  # blocks, rounds or repaired stretches, if any
+    patches: PatchRanges | None = None  # patches, if any
+    fixtures: tuple[str, ...] = ()  # furniture that may be drawn, by name
+    always: tuple[str, ...] = ()  # furniture that belongs to the lining itself
 
     def draw_relief(self, rng: np.random.Generator, length: float, half_width: float) -> list[Any]:
         """Draw relief of the kind's own, which the ranges do not describe; by default none.
@@ -290,25 +225,15 @@ KINDS: dict[str, Kind] = {
 
 @dataclasses.dataclass(frozen=True)
 class FixtureRanges:
-    """Things of one sort that stand or hang at the wall, or niches in it.
+    """Things of one sort that stand or hang at the wall, or niches in it."""
 
-    Attributes:
-        spacing: Distance from one to the next on one side, m; drawn once a tunnel.
-        jitter: Standard deviation of each one's place, over the spacing, 1.
-        length: Length along the tunnel, m.
-        depth: Height out of the wall, m; below 0 it is the depth of a niche.
-        low: Lower end above the floor, m.
-        high: Upper end above the floor, m.
-        sides: Number of sides it stands on: 1, or 2 with the sides staggered by half a spacing.
-    """
-
-    spacing: Range
-    jitter: float
-    length: Range
-    depth: Range
-    low: Range
-    high: Range
-    sides: int
+    spacing: Range  # distance from one to the next on one side, m; drawn once a tunnel
+    jitter: float  # standard deviation of each one's place, over the spacing, 1
+    length: Range  # length along the tunnel, m
+    depth: Range  # height out of the wall, m; below 0 it is the depth of a niche
+    low: Range  # lower end above the floor, m
+    high: Range  # upper end above the floor, m
+    sides: int  # number of sides it stands on: 1, or 2 with the sides staggered by half a spacing
 
 
 FIXTURES = {

@@ -41,19 +41,12 @@ class Mount:
 
 @dataclasses.dataclass(frozen=True)
 class Section:
-    """Design section as a closed outline, in the direction of growing angle from below the floor.
+    """Design section as a closed outline, in the direction of growing angle from below the floor."""
 
-    Attributes:
-        outline: Points, m to the left of the lining's middle line and above the floor, `(k, 2)`.
-        centre: Height of the lining's own middle, m.
-        height: Height of the crown, m.
-        half_width: Half the largest width, m.
-    """
-
-    outline: Float[np.ndarray, "k 2"]
-    centre: float
-    height: float
-    half_width: float
+    outline: Float[np.ndarray, "k 2"]  # points, m to the left of the lining's middle line and above the floor, `(k, 2)`
+    centre: float  # height of the lining's own middle, m
+    height: float  # height of the crown, m
+    half_width: float  # half the largest width, m
 
     @classmethod
     def draw(cls, rng: np.random.Generator, ranges: SectionRanges) -> Section:

@@ -87,7 +87,6 @@ def _place(
     station: np.ndarray, lateral: np.ndarray, height: np.ndarray, half: np.ndarray, alignment: Alignment,
     elevation: np.ndarray,
 ) -> Float[np.ndarray, "k 13"]:  # fmt: skip
-    """Return level bricks at places along the axis."""
     floor = np.interp(station, alignment.station, elevation)
     centre = np.column_stack([alignment.offset(station, lateral), floor + height])
     return make_bricks(centre, alignment.heading(station), half)

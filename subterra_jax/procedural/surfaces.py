@@ -17,19 +17,14 @@ _DIGITS = 9  # of a height in metres: sums in another order, as another BLAS has
 
 @dataclasses.dataclass(frozen=True)
 class Grid:
-    """Grid on which a wall is known.
+    """Grid on which a wall is known."""
 
-    Attributes:
-        station: Uniform stations from 0, m, `(n,)`.
-        angle: Angles about the axis, from the left towards the crown, rad, `(m,)`.
-        bearing: Angles about the middle of the lining of the wall at those angles, rad, `(m,)`; another than the axis
-            where the invert of a circle is filled, or a walkway moves the robot aside.
-        girth: Way around the section from the floor's middle to each angle, m, `(m,)`; the seam is in the floor.
-    """
-
-    station: Float[np.ndarray, " n"]
-    angle: Float[np.ndarray, " m"]
+    station: Float[np.ndarray, " n"]  # uniform stations from 0, m, `(n,)`
+    angle: Float[np.ndarray, " m"]  # angles about the axis, from the left towards the crown, rad, `(m,)`
+    # angles about the middle of the lining of the wall at those angles, rad, `(m,)`; another than the axis where the
+    # invert of a circle is filled, or a walkway moves the robot aside
     bearing: Float[np.ndarray, " m"]
+    # way around the section from the floor's middle to each angle, m, `(m,)`; the seam is in the floor
     girth: Float[np.ndarray, " m"]
 
 
@@ -38,16 +33,11 @@ class Waves:
     """Gaussian random surface with the covariance `sd² exp(−d² / length²)`, as a sum of cosines.
 
     Source: Rahimi and Recht 2007, random Fourier features of the squared-exponential kernel.
-
-    Attributes:
-        frequency: Angular frequencies along and around, rad/m, `(k, 2)`.
-        phase: Phases, rad, `(k,)`.
-        amplitude: Amplitude of each cosine, m.
     """
 
-    frequency: Float[np.ndarray, "k 2"]
-    phase: Float[np.ndarray, " k"]
-    amplitude: float
+    frequency: Float[np.ndarray, "k 2"]  # angular frequencies along and around, rad/m, `(k, 2)`
+    phase: Float[np.ndarray, " k"]  # phases, rad, `(k,)`
+    amplitude: float  # amplitude of each cosine, m
 
     @classmethod
     def draw(cls, rng: np.random.Generator, sd: float, length: float) -> Waves:
@@ -70,23 +60,14 @@ class Waves:
 
 @dataclasses.dataclass(frozen=True)
 class Rings:
-    """Rings of segments, each segment a little out of place.
+    """Rings of segments, each segment a little out of place."""
 
-    Attributes:
-        nominal: Ring length on the drawings, m.
-        joint: Stations of the ring joints as built, m, `(r,)`.
-        turn: Turn of each ring, rad, `(r + 1,)`.
-        edge: Angles at which segments of an unturned ring begin, rad, growing, `(g,)`.
-        place: Radial place of each segment, m, `(r + 1, g)`.
-        oval: Excess of the horizontal radius, m.
-    """
-
-    nominal: float
-    joint: Float[np.ndarray, " r"]
-    turn: Float[np.ndarray, " rings"]
-    edge: Float[np.ndarray, " g"]
-    place: Float[np.ndarray, "rings g"]
-    oval: float
+    nominal: float  # ring length on the drawings, m
+    joint: Float[np.ndarray, " r"]  # stations of the ring joints as built, m, `(r,)`
+    turn: Float[np.ndarray, " rings"]  # turn of each ring, rad, `(r + 1,)`
+    edge: Float[np.ndarray, " g"]  # angles at which segments of an unturned ring begin, rad, growing, `(g,)`
+    place: Float[np.ndarray, "rings g"]  # radial place of each segment, m, `(r + 1, g)`
+    oval: float  # excess of the horizontal radius, m
 
     @classmethod
     def draw(cls, rng: np.random.Generator, ranges: RingRanges, length: float, radius: float, bolts: int) -> Rings:
@@ -123,19 +104,12 @@ class Rings:
 
 @dataclasses.dataclass(frozen=True)
 class Stretches:
-    """Blocks, rounds or repaired stretches.
+    """Blocks, rounds or repaired stretches."""
 
-    Attributes:
-        joint: Stations where one ends and the next begins, m, `(r,)`.
-        offset: Radial place of each, m, `(r + 1,)`.
-        shift: Place of each to the left and upwards, m, `(r + 1, 2)`.
-        flare: Growth of the radius over a stretch, m.
-    """
-
-    joint: Float[np.ndarray, " r"]
-    offset: Float[np.ndarray, " stretches"]
-    shift: Float[np.ndarray, "stretches 2"]
-    flare: float
+    joint: Float[np.ndarray, " r"]  # stations where one ends and the next begins, m, `(r,)`
+    offset: Float[np.ndarray, " stretches"]  # radial place of each, m, `(r + 1,)`
+    shift: Float[np.ndarray, "stretches 2"]  # place of each to the left and upwards, m, `(r + 1, 2)`
+    flare: float  # growth of the radius over a stretch, m
 
     @classmethod
     def draw(cls, rng: np.random.Generator, ranges: StretchRanges, length: float) -> Stretches:
@@ -163,17 +137,11 @@ class Stretches:
 
 @dataclasses.dataclass(frozen=True)
 class Patches:
-    """Rectangles that stand a little out of the wall or in it.
+    """Rectangles that stand a little out of the wall or in it."""
 
-    Attributes:
-        station: Their begins and ends, m, `(p, 2)`.
-        girth: Their edges around the section, m, `(p, 2)`.
-        relief_of: Distance of the wall outside the section there, m, `(p,)`.
-    """
-
-    station: Float[np.ndarray, "p 2"]
-    girth: Float[np.ndarray, "p 2"]
-    relief_of: Float[np.ndarray, " p"]
+    station: Float[np.ndarray, "p 2"]  # their begins and ends, m, `(p, 2)`
+    girth: Float[np.ndarray, "p 2"]  # their edges around the section, m, `(p, 2)`
+    relief_of: Float[np.ndarray, " p"]  # distance of the wall outside the section there, m, `(p,)`
 
     @classmethod
     def draw(cls, rng: np.random.Generator, ranges: PatchRanges, length: float, around: float) -> Patches:

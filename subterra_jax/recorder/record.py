@@ -177,7 +177,6 @@ def _truth_facts(
 
 
 def _write_facts(folder: Path, content: dict[str, Any]) -> None:
-    """Write the facts of a folder to a JSON file of the same name."""
     (folder / f"{folder.name}.json").write_text(json.dumps(content, indent=1, default=str) + "\n")
 
 

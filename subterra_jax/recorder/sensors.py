@@ -26,17 +26,11 @@ from subterra_jax.tunnel_env import TunnelEnv
 
 @dataclasses.dataclass(frozen=True)
 class Poses:
-    """Poses over time.
+    """Poses over time."""
 
-    Attributes:
-        time: Time since the start, s, `(n,)`.
-        position: Positions, m, `(n, 3)`.
-        rotation: Rotations from the body to the fixed frame, `n` of them.
-    """
-
-    time: Float[np.ndarray, " n"]
-    position: Float[np.ndarray, "n 3"]
-    rotation: Rotation
+    time: Float[np.ndarray, " n"]  # time since the start, s, `(n,)`
+    position: Float[np.ndarray, "n 3"]  # positions, m, `(n, 3)`
+    rotation: Rotation  # rotations from the body to the fixed frame, `n` of them
 
     def __len__(self) -> int:
         return len(self.time)
@@ -102,17 +96,11 @@ _HALF_STEP = 1e-3  # s, of the central difference of the attitude
 
 @dataclasses.dataclass(frozen=True)
 class Inertial:
-    """Samples of the IMU in its own frame, which is oriented like `base_link`.
+    """Samples of the IMU in its own frame, which is oriented like `base_link`."""
 
-    Attributes:
-        time: Time since the start, s, `(n,)`.
-        gyro: Rates, rad/s, `(n, 3)`.
-        accel: Specific force, m/s², `(n, 3)`; +9.8 upwards at rest.
-    """
-
-    time: Float[np.ndarray, " n"]
-    gyro: Float[np.ndarray, "n 3"]
-    accel: Float[np.ndarray, "n 3"]
+    time: Float[np.ndarray, " n"]  # time since the start, s, `(n,)`
+    gyro: Float[np.ndarray, "n 3"]  # rates, rad/s, `(n, 3)`
+    accel: Float[np.ndarray, "n 3"]  # specific force, m/s², `(n, 3)`; +9.8 upwards at rest
 
 
 def measure_imu(poses: Poses, seed: int, noise: float = 1.0) -> Inertial:

@@ -23,34 +23,24 @@ N_POSE = 19  # position, quaternion and joints of a robot on legs
 
 @dataclasses.dataclass(frozen=True)
 class Trace:
-    """An episode of `n` steps so far, on the host; row k is the moment after k periods, from 0 to n.
+    """An episode of `n` steps so far, on the host; row k is the moment after k periods, from 0 to n."""
 
-    Attributes:
-        state: States, each leaf with a leading axis of `n + 1`.
-        observation: Observations as the agent got them.
-        action: Action that led to row k + 1 as the agent gave it: speed (m/s), yaw rate (rad/s), estimated station
-            (m; NaN for none), log of its standard deviation, direction.
-        reward: Reward of the step that led to row k + 1.
-        coverage: Share of the tunnel covered by then.
-        cloud: Some of the agent's particles: station and lateral offset, m, and weight over the mean weight; `p` is 0
-            without a particle filter.
-        pose: Position (tunnel frame, m), orientation w, x, y, z and joints (rad) of a robot on legs at `m` even times
-            up to a row, the last at the row itself; `m` is 0 on wheels.
-        period: Control period, s.
-        success: The task was achieved.
-        contact: The episode ended at a wall or an obstacle.
-    """
-
-    state: State
-    observation: Float[np.ndarray, "rows n_obs"]
+    state: State  # states, each leaf with a leading axis of `n + 1`
+    observation: Float[np.ndarray, "rows n_obs"]  # observations as the agent got them
+    # action that led to row k + 1 as the agent gave it: speed (m/s), yaw rate (rad/s), estimated station (m; NaN for
+    # none), log of its standard deviation, direction
     action: Float[np.ndarray, "n 5"]
-    reward: Float[np.ndarray, "n"]
-    coverage: Float[np.ndarray, "n"]
+    reward: Float[np.ndarray, "n"]  # reward of the step that led to row k + 1
+    coverage: Float[np.ndarray, "n"]  # share of the tunnel covered by then
+    # some of the agent's particles: station and lateral offset, m, and weight over the mean weight; `p` is 0 without a
+    # particle filter
     cloud: Float[np.ndarray, "rows p 3"]
+    # position (tunnel frame, m), orientation w, x, y, z and joints (rad) of a robot on legs at `m` even times up to a
+    # row, the last at the row itself; `m` is 0 on wheels
     pose: Float[np.ndarray, "rows m 19"]
-    period: float
-    success: bool = False
-    contact: bool = False
+    period: float  # control period, s
+    success: bool = False  # the task was achieved
+    contact: bool = False  # the episode ended at a wall or an obstacle
 
     def __len__(self) -> int:
         return len(self.action)
@@ -174,12 +164,10 @@ class _Legs:
         return np.tile(pose, (1, round(float(params.vehicle.period) / self.physics.period), 1))
 
     def release(self) -> None:
-        """Collect no more."""
         if self.physics is not None:
             self.physics.bench.watch = None
 
     def take(self, n_rows: int) -> Float[np.ndarray, "n_rows m 19"]:
-        """Return the poses since the last call, in `n_rows` rows."""
         poses, self._poses = self._poses, []
         return np.array(poses).reshape(n_rows, -1, N_POSE) if poses else np.zeros((n_rows, 0, N_POSE))
 

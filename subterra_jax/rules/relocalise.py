@@ -17,13 +17,9 @@ from subterra_jax.tunnel import Tunnel
 
 @struct.dataclass
 class RelocaliseState(GoalState):
-    """Start of one episode, and the distance driven since.
+    """Start of one episode, and the distance driven since."""
 
-    Attributes:
-        travelled: True distance driven, m.
-    """
-
-    travelled: Float[Array, ""]
+    travelled: Float[Array, ""]  # true distance driven, m
 
 
 @dataclasses.dataclass(frozen=True)

@@ -56,19 +56,12 @@ class Start:
 
 
 class Choice(NamedTuple):
-    """A start and a goal chosen by the caller in place of drawn ones; NaN leaves what was drawn.
+    """A start and a goal chosen by the caller in place of drawn ones; NaN leaves what was drawn."""
 
-    Attributes:
-        station: Station of the start, m.
-        lateral: Distance of the start to the left of the centreline, m.
-        heading: Angle of the start to the centreline, rad; 0 faces growing stations.
-        goal: Station of the goal, m.
-    """
-
-    station: Any = jnp.nan
-    lateral: Any = jnp.nan
-    heading: Any = jnp.nan
-    goal: Any = jnp.nan
+    station: Any = jnp.nan  # station of the start, m
+    lateral: Any = jnp.nan  # distance of the start to the left of the centreline, m
+    heading: Any = jnp.nan  # angle of the start to the centreline, rad; 0 faces growing stations
+    goal: Any = jnp.nan  # station of the goal, m
 
 
 @dataclasses.dataclass(frozen=True)

@@ -70,39 +70,26 @@ class GoalRewardParams:
 
 @struct.dataclass
 class ToldParams:
-    """Errors of what an agent is told.
+    """Errors of what an agent is told."""
 
-    Attributes:
-        pitch_error: Relative error of the ring length told against that of the tunnel's drawings, 1; for ablations.
-    """
-
+    # relative error of the ring length told against that of the tunnel's drawings, 1; for ablations
     pitch_error: float = 0.0
 
 
 @struct.dataclass
 class GoalState:
-    """Goal of one episode.
+    """Goal of one episode."""
 
-    Attributes:
-        station: Station of the goal, m.
-        still: Steps that the robot has stood.
-    """
-
-    station: Float[Array, ""]
-    still: Int[Array, ""]
+    station: Float[Array, ""]  # station of the goal, m
+    still: Int[Array, ""]  # steps that the robot has stood
 
 
 @struct.dataclass
 class StopState(GoalState):
-    """Goal of one episode, and what is told.
+    """Goal of one episode, and what is told."""
 
-    Attributes:
-        told: Station of the start as it is told, m.
-        pitch: Ring length as it is told, m; 0 where there are no rings.
-    """
-
-    told: Float[Array, ""]
-    pitch: Float[Array, ""]
+    told: Float[Array, ""]  # station of the start as it is told, m
+    pitch: Float[Array, ""]  # ring length as it is told, m; 0 where there are no rings
 
 
 class GoalRule(Rule):

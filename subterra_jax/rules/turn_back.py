@@ -16,13 +16,9 @@ from subterra_jax.tunnel import Tunnel
 
 @struct.dataclass
 class ReturnState(StopState):
-    """Goal of one episode, and whether the robot is on its way back, which ends at the station told as the start.
+    """Goal of one episode, and whether the robot is on its way back, which ends at the station told as the start."""
 
-    Attributes:
-        flag: 1 once the goal has been reached, else 0.
-    """
-
-    flag: Float[Array, ""]
+    flag: Float[Array, ""]  # 1 once the goal has been reached, else 0
 
 
 @dataclasses.dataclass(frozen=True)

@@ -172,7 +172,6 @@ def _numbers(name: str, values: ArrayLike, shape: tuple[int | None, ...]) -> np.
 
 
 def _per_vertex(name: str, values: ArrayLike, n: int) -> Float[np.ndarray, " n"]:
-    """Return one number for each vertex of the centreline."""
     array = _numbers(name, values, (None,) if np.ndim(values) else ())
     if array.ndim and len(array) != n:
         raise TunnelError(f"{name} has {len(array)} values, the centreline {n} vertices")
@@ -336,7 +335,6 @@ def _reaches(
 
 
 def _wall(plan: TunnelPlan, name: str, vertex: Float[np.ndarray, "k 2"]) -> Wall:
-    """Return a wall with the stations of its vertices."""
     from scipy.spatial import KDTree  # half a second to import, and only tunnels by hand need it
 
     node = KDTree(plan.centre).query(vertex)[1]

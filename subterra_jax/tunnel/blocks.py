@@ -141,42 +141,26 @@ PADDING_CENTRE, PADDING_THICKNESS = 1e6, -1.0
 
 @dataclasses.dataclass(frozen=True)
 class Blocks:
-    """Blocks of wall, in order of station.
+    """Blocks of wall, in order of station."""
 
-    Attributes:
-        centre: Middle of each box, m, `(n_blocks, 2)`; exactly representable in float32.
-        half: Half the long axis of each box as a vector, m, `(n_blocks, 2)`.
-        thickness: Half the thickness of each box, m, `(n_blocks,)`.
-        offset: Vertices of each block from the middle of its box, m, `(n_blocks, m, 2)`; padded with the last one.
-        count: Vertices of each block without padding, `(n_blocks,)`.
-        station: Station of the middle of each block, m, `(n_blocks,)`.
-    """
-
-    centre: np.ndarray
-    half: np.ndarray
-    thickness: np.ndarray
+    centre: np.ndarray  # middle of each box, m, `(n_blocks, 2)`; exactly representable in float32
+    half: np.ndarray  # half the long axis of each box as a vector, m, `(n_blocks, 2)`
+    thickness: np.ndarray  # half the thickness of each box, m, `(n_blocks,)`
+    # vertices of each block from the middle of its box, m, `(n_blocks, m, 2)`; padded with the last one
     offset: np.ndarray
-    count: np.ndarray
-    station: np.ndarray
+    count: np.ndarray  # vertices of each block without padding, `(n_blocks,)`
+    station: np.ndarray  # station of the middle of each block, m, `(n_blocks,)`
 
 
 @dataclasses.dataclass(frozen=True)
 class _Pieces:
-    """Pieces of polylines, each a run of vertices of one long list.
+    """Pieces of polylines, each a run of vertices of one long list."""
 
-    Attributes:
-        vertex: All vertices, m.
-        first: First vertex of each piece.
-        last: Last vertex of each piece.
-        station: Station of the middle of each, m.
-        inward: -1 for a left wall, +1 for a right wall, 0 for furniture.
-    """
-
-    vertex: Float[np.ndarray, "v 2"]
-    first: Int[np.ndarray, " n"]
-    last: Int[np.ndarray, " n"]
-    station: Float[np.ndarray, " n"]
-    inward: Float[np.ndarray, " n"]
+    vertex: Float[np.ndarray, "v 2"]  # all vertices, m
+    first: Int[np.ndarray, " n"]  # first vertex of each piece
+    last: Int[np.ndarray, " n"]  # last vertex of each piece
+    station: Float[np.ndarray, " n"]  # station of the middle of each, m
+    inward: Float[np.ndarray, " n"]  # -1 for a left wall, +1 for a right wall, 0 for furniture
 
 
 def _join(parts: list[_Pieces]) -> _Pieces:

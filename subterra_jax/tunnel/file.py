@@ -250,7 +250,6 @@ def _lateral(plan: TunnelPlan, wall: Wall) -> np.ndarray:
 
 
 def _read_shell(fields: _Fields, plan: TunnelPlan) -> Shell:
-    """Read the bore in three dimensions."""
     n = len(plan.station)
     angle, rise = fields.numbers("shell_angle", None), fields.numbers("shell_rise", n)
     m = len(angle)

@@ -27,20 +27,16 @@ class Order:
     A beam visits the blocks from `start` on, and then those before it, outward. Across the tunnel at each block lies a
     plane. Whatever is still to be visited lies beyond it, however the tunnel bends, so a beam that does not reach the
     plane before the wall that it has met is done.
-
-    Attributes:
-        start: First block at or beyond each node of the station grid, `(n,)`.
-        normal: Of the plane at each block, along the tunnel, `(n_blocks, 2)`; at most of length 1, with coordinates of
-            16 bits, so that all kernels read the same.
-        ahead: Distance along the normal from the middle of each block to the plane behind which it and all later
-            blocks lie, m, `(n_blocks,)`, scaled like the normal.
-        behind: The same against the normal, for it and all earlier blocks.
     """
 
-    start: np.ndarray
+    start: np.ndarray  # first block at or beyond each node of the station grid, `(n,)`
+    # of the plane at each block, along the tunnel, `(n_blocks, 2)`; at most of length 1, with coordinates of 16 bits,
+    # so that all kernels read the same
     normal: np.ndarray
+    # distance along the normal from the middle of each block to the plane behind which it and all later blocks lie, m,
+    # `(n_blocks,)`, scaled like the normal
     ahead: np.ndarray
-    behind: np.ndarray
+    behind: np.ndarray  # the same against the normal, for it and all earlier blocks
 
 
 def order(plan: TunnelPlan, blocks: Blocks, first: np.ndarray, count: np.ndarray) -> Order:

@@ -20,17 +20,14 @@ _HIGH = np.uint32(0xFFFF0000)
 
 @struct.dataclass
 class Packed:
-    """Boxes, planes and walls of blocks; the walls are those of the `Tunnel`, the boxes hold its boxes.
+    """Boxes, planes and walls of blocks; the walls are those of the `Tunnel`, the boxes hold its boxes."""
 
-    Attributes:
-        block: Words of each block: the middle x, y of its box (m, float32); half its long axis x, y; half its thickness
-            and its vertex pairs; the normal x, y of its plane; how far ahead and behind the plane is (m); its first
-            vertex pair; 0. Two numbers in one word have 16 bits each, floats the upper half of 32.
-        wall: Vertex pairs of all blocks as x, y, x, y, from the middle of the block's box, m; the last vertex of a
-            block twice if their number is odd.
-    """
-
+    # Words of each block: the middle x, y of its box (m, float32); half its long axis x, y; half its thickness and its
+    # vertex pairs; the normal x, y of its plane; how far ahead and behind the plane is (m); its first vertex pair; 0.
+    # Two numbers in one word have 16 bits each, floats the upper half of 32.
     block: Int[Array, "n_blocks 8"]
+    # vertex pairs of all blocks as x, y, x, y, from the middle of the block's box, m; the last vertex of a block twice
+    # if their number is odd
     wall: Float[Array, "n_pairs 4"]
 
 
@@ -94,7 +91,6 @@ def unpack(words: Sequence[Array]) -> tuple[Array, ...]:
 
 
 def _two(word: Array) -> tuple[Array, Array]:
-    """Return the two numbers in one word."""
     halves = word & jnp.int32(-(1 << 16)), word << 16
     return tuple(jax.lax.bitcast_convert_type(half, jnp.float32) for half in halves)  # type: ignore[return-value]
 

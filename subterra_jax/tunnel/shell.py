@@ -18,49 +18,30 @@ N_BRICK = 13
 
 @dataclasses.dataclass(frozen=True)
 class ShellLining:
-    """Things of one variant of the lining.
+    """Things of one variant of the lining."""
 
-    Attributes:
-        pocket: Recesses: station and angle of the middle, length along and width around the wall, depth (m, rad),
-            `(p, 5)`. Niches are recesses.
-        brick: Furniture, see `make_bricks`, `(k, 13)`.
-        seam: Angle at which the wall is cut open to be rolled out flat, rad; no recess lies there.
-        radius: Section of this variant, m, `(n, m)`; `None` where it is the shell's.
-    """
-
+    # Recesses: station and angle of the middle, length along and width around the wall, depth (m, rad), `(p, 5)`.
+    # Niches are recesses.
     pocket: np.ndarray
-    brick: np.ndarray
-    seam: float = 1.5 * np.pi
-    radius: np.ndarray | None = None
+    brick: np.ndarray  # furniture, see `make_bricks`, `(k, 13)`
+    seam: float = 1.5 * np.pi  # angle at which the wall is cut open to be rolled out flat, rad; no recess lies there
+    radius: np.ndarray | None = None  # section of this variant, m, `(n, m)`; `None` where it is the shell's
 
 
 @dataclasses.dataclass(frozen=True)
 class Shell:
-    """A bore in three dimensions, in the tunnel frame.
+    """A bore in three dimensions, in the tunnel frame."""
 
-    Attributes:
-        station: Uniform stations from 0, m, `(n,)`; those of the plan, or others.
-        position: Axis through the middle of the section, m, `(n, 3)`.
-        tangent: Unit vectors of growing station, with the grade, `(n, 3)`.
-        angle: Directions around the axis, uniform and growing over one turn less a step, rad, `(m,)`.
-        radius: Distance of the smooth wall from the axis, m, `(n, m)`.
-        section: Mean section, by which the wall is rolled out flat, m, `(m,)`.
-        track: Rails, sleepers and slab of every variant, see `make_bricks`, `(t, 13)`.
-        linings: Variant name to what it adds.
-        spacing: Distance of the points of the triangulated wall, along and around, m.
-        window: First and last station of the piece that was cut out, m.
-    """
-
-    station: np.ndarray
-    position: np.ndarray
-    tangent: np.ndarray
-    angle: np.ndarray
-    radius: np.ndarray
-    section: np.ndarray
-    track: np.ndarray
-    linings: dict[str, ShellLining]
-    spacing: tuple[float, float] = SPACING
-    window: tuple[float, float] = (0.0, np.inf)
+    station: np.ndarray  # uniform stations from 0, m, `(n,)`; those of the plan, or others
+    position: np.ndarray  # axis through the middle of the section, m, `(n, 3)`
+    tangent: np.ndarray  # unit vectors of growing station, with the grade, `(n, 3)`
+    angle: np.ndarray  # directions around the axis, uniform and growing over one turn less a step, rad, `(m,)`
+    radius: np.ndarray  # distance of the smooth wall from the axis, m, `(n, m)`
+    section: np.ndarray  # mean section, by which the wall is rolled out flat, m, `(m,)`
+    track: np.ndarray  # rails, sleepers and slab of every variant, see `make_bricks`, `(t, 13)`
+    linings: dict[str, ShellLining]  # variant name to what it adds
+    spacing: tuple[float, float] = SPACING  # distance of the points of the triangulated wall, along and around, m
+    window: tuple[float, float] = (0.0, np.inf)  # first and last station of the piece that was cut out, m
 
     @property
     def left(self) -> np.ndarray:

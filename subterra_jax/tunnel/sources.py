@@ -110,7 +110,6 @@ def resolve(
 
 
 def _listed(tunnel: TunnelPlan | str | Path | Sequence[Source] | None) -> list[Source]:
-    """Return the tunnels that a user names, one by one."""
     if tunnel is None:
         return [PACKAGED[0]]
     if isinstance(tunnel, str | Path):

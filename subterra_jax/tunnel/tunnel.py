@@ -186,19 +186,13 @@ def _on_device(values: Any, dtype: Any) -> Array:
 
 @struct.dataclass
 class Foot:
-    """Position of a point along and across a tunnel.
+    """Position of a point along and across a tunnel."""
 
-    Attributes:
-        station: Station of the nearest point of the centreline, m; below 0 or beyond the length outside a mouth.
-        lateral: Distance to the left of the centreline, m.
-        half_width: Half the distance between the smooth walls there, m.
-        tangent: Unit tangent of the centreline there.
-    """
-
+    # station of the nearest point of the centreline, m; below 0 or beyond the length outside a mouth
     station: Float[Array, ""]
-    lateral: Float[Array, ""]
-    half_width: Float[Array, ""]
-    tangent: Float[Array, "2"]
+    lateral: Float[Array, ""]  # distance to the left of the centreline, m
+    half_width: Float[Array, ""]  # half the distance between the smooth walls there, m
+    tangent: Float[Array, "2"]  # unit tangent of the centreline there
 
 
 def node_at(tunnel: Tunnel, station: Float[Array, ""]) -> Int[Array, ""]:
@@ -326,7 +320,6 @@ def _padding(count: int) -> np.ndarray:
 
 
 def _join_packed(tunnels: Sequence[Tunnel], n_blocks: np.ndarray) -> Packed | None:
-    """Join the packed blocks of tunnels, padded to numbers of blocks."""
     if any(t.packed is None for t in tunnels):
         return None
     parts = []

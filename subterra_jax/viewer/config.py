@@ -21,36 +21,23 @@ LININGS = ("pockets", "smooth", "furnished")
 
 @dataclass(frozen=True)
 class ViewerConfig:
-    """Tunnels, task and driver to show, and the address to serve them at.
+    """Tunnels, task and driver to show, and the address to serve them at."""
 
-    Attributes:
-        scene: Scene folder with the lining, track and tunnel to show; `None`: no scene.
-        tunnels: Further tunnel files, or names as for `load_tunnel`.
-        task: Id of the first task, as `Subterra/StopAt-v1` or `StopAt`.
-        agent: First driver: a baseline, `policy:NAME`, `policy:FILE`, `policy:RUN-FOLDER`, `module:Class` or
-            `FILE.py:Class`.
-        policies: Trained policies, `.safetensors` files or run folders, offered beside the baselines.
-        lining: First variant of the walls.
-        sensor: The robot's LiDAR, as for `subterra_jax.make`; of one in three dimensions the points are shown.
-        seed: Seed of the first episode.
-        recordings: Folder for saved episodes and pictures.
-        replay: First episode, if it is a recorded one.
-        host: Address to listen on. The default is this machine alone.
-        port: First port to try.
-    """
-
-    scene: Path | None = None
-    tunnels: tuple[str, ...] = ()
-    task: str = "Subterra/StopAt-v1"
+    scene: Path | None = None  # scene folder with the lining, track and tunnel to show; `None`: no scene
+    tunnels: tuple[str, ...] = ()  # further tunnel files, or names as for `load_tunnel`
+    task: str = "Subterra/StopAt-v1"  # id of the first task, as `Subterra/StopAt-v1` or `StopAt`
+    # first driver: a baseline, `policy:NAME`, `policy:FILE`, `policy:RUN-FOLDER`, `module:Class` or `FILE.py:Class`
     agent: str = "dead-reckoning"
+    # trained policies, `.safetensors` files or run folders, offered beside the baselines
     policies: tuple[Path, ...] = field(default=())
-    lining: str = "pockets"
+    lining: str = "pockets"  # first variant of the walls
+    # the robot's LiDAR, as for `subterra_jax.make`; of one in three dimensions the points are shown
     sensor: str = SENSORS[0]
-    seed: int = 0
-    recordings: Path = Path("out/viewer")
-    replay: Path | None = None
-    host: str = LOOPBACK
-    port: int = 8080
+    seed: int = 0  # seed of the first episode
+    recordings: Path = Path("out/viewer")  # folder for saved episodes and pictures
+    replay: Path | None = None  # first episode, if it is a recorded one
+    host: str = LOOPBACK  # Address to listen on. The default is this machine alone.
+    port: int = 8080  # first port to try
 
 
 def check_config(config: ViewerConfig) -> ViewerConfig:

@@ -66,7 +66,6 @@ def _facts(trace: Trace, env: TunnelEnv, params: EnvParams) -> dict[str, Any]:
 
 
 def _series(trace: Trace, done: int, env: TunnelEnv, params: EnvParams) -> dict[str, Any]:
-    """Return the series of a recording from row `done` on."""
     fields, rows, before = env.fields(params), slice(done, None), slice(max(done - 1, 0), None)
     obs, state, pose = trace.observation[rows], trace.state, trace.pose[rows]
     action, reward, coverage, command = (

@@ -15,13 +15,9 @@ from subterra_jax.viewer.recording import Recording
 
 @dataclasses.dataclass(frozen=True)
 class Centreline:
-    """A tunnel's centreline and its ground in three dimensions.
+    """A tunnel's centreline and its ground in three dimensions."""
 
-    Attributes:
-        plan: The tunnel.
-    """
-
-    plan: TunnelPlan
+    plan: TunnelPlan  # the tunnel
 
     def ground(self, station: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
         """Return the height of the ground, m; level beyond the mouths."""
@@ -226,23 +222,14 @@ WALL_HEIGHT = 2.6  # m, for looks: the file holds one height only
 
 @dataclasses.dataclass(frozen=True)
 class Shape:
-    """A surface of one colour.
+    """A surface of one colour."""
 
-    Attributes:
-        name: Name of the surface.
-        vertices: Vertices, tunnel frame, m.
-        faces: Rows of `vertices`, counter-clockwise as seen from within the tunnel.
-        colour: Red, green, blue, 0 to 255.
-        flat: Shade each face by its own normal.
-        group: `lining` or `track`; a group is shown and hidden as one.
-    """
-
-    name: str
-    vertices: Float[np.ndarray, "v 3"]
-    faces: Int[np.ndarray, "f 3"]
-    colour: Colour
-    flat: bool = True
-    group: str = "lining"
+    name: str  # name of the surface
+    vertices: Float[np.ndarray, "v 3"]  # vertices, tunnel frame, m
+    faces: Int[np.ndarray, "f 3"]  # rows of `vertices`, counter-clockwise as seen from within the tunnel
+    colour: Colour  # Red, green, blue, 0 to 255
+    flat: bool = True  # shade each face by its own normal
+    group: str = "lining"  # `lining` or `track`; a group is shown and hidden as one
 
 
 def planar_shapes(plan: TunnelPlan, lining: str) -> list[Shape]:

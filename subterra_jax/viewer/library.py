@@ -139,11 +139,9 @@ class Library:
         return self._plans[title]
 
     def digest(self, title: str) -> str:
-        """Return the SHA-256 of a tunnel."""
         return tunnel_digest(self.tunnels[title].source)
 
     def recordings(self) -> tuple[str, ...]:
-        """Return the names of the recorded episodes in the folder."""
         return tuple(sorted(path.name for path in self._folder.glob("*.npz") if path.is_file()))
 
     def load_recording(self, name: str) -> Recording:
@@ -172,7 +170,6 @@ class Library:
         )
 
     def path_for(self, name: str) -> Path:
-        """Return the path for saving a file of that name."""
         return self._folder / Path(name).name
 
 

@@ -105,7 +105,6 @@ class Charts:
         self._reward = _chart(server, "reward so far", (_line("reward", _RETURN),))
 
     def show(self, episode: EpisodeGeometry, row: int) -> None:
-        """Draw the curves from the start to a row."""
         rows = _sample_rows(row)
         time, coverage, reward = (values[rows] for values in progress_series(episode))
         self._coverage.data, self._reward.data = (time, coverage), (time, reward)
@@ -161,21 +160,13 @@ def legend(recording: Recording | None) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class Choice:
-    """An episode to drive.
+    """An episode to drive."""
 
-    Attributes:
-        tunnel: Title of the tunnel.
-        lining: Variant of its walls.
-        task: Id of the task.
-        agent: Name of the driver.
-        seed: Seed of the episode.
-    """
-
-    tunnel: str
-    lining: str
-    task: str
-    agent: str
-    seed: int
+    tunnel: str  # title of the tunnel
+    lining: str  # variant of its walls
+    task: str  # id of the task
+    agent: str  # name of the driver
+    seed: int  # seed of the episode
 
 
 class Panel:
@@ -220,11 +211,9 @@ class Panel:
 
     @property
     def choice(self) -> Choice:
-        """Present choice."""
         return Choice(self.tunnel.value, self.lining.value, self.task.value, self.agent.value, int(self.seed.value))
 
     def choose(self, choice: Choice) -> None:
-        """Set the controls to a choice."""
         set_value(self.tunnel, choice.tunnel)
         set_value(self.lining, choice.lining)
         for control, value in ((self.task, choice.task), (self.agent, choice.agent)):
@@ -233,17 +222,14 @@ class Panel:
         set_value(self.seed, choice.seed)
 
     def show_legend(self, recording: Recording) -> None:
-        """Show the legend of an episode."""
         if (text := legend(recording)) != self._legend.content:
             self._legend.content = text
 
     def list_recordings(self, names: tuple[str, ...], chosen: str) -> None:
-        """Replace the list of recorded episodes."""
         self.recorded.options = names or (NO_RECORDING,)
         set_value(self.recorded, chosen)
 
     def speed_factor(self) -> float:
-        """Return the seconds of the episode per second."""
         return float(self.speed.value.split()[0])
 
 

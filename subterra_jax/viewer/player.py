@@ -37,7 +37,6 @@ class Player:
 
     @property
     def episode(self) -> EpisodeGeometry | None:
-        """Episode that is shown."""
         return self._episode
 
     @property
@@ -47,21 +46,17 @@ class Player:
         return 0.0 if episode is None else self._at * episode.recording.period
 
     def start(self) -> None:
-        """Start the clock."""
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop the clock for good."""
         self._stop.set()
         self._thread.join(timeout=2.0)
 
     def begin(self, episode: EpisodeGeometry, *, playing: bool) -> None:
-        """Show another episode from its start."""
         with self._lock:
             self._episode, self._at, self.playing, self._dirty = episode, 0.0, playing, True
 
     def grow(self, episode: EpisodeGeometry) -> None:
-        """Replace the episode by a longer recording of it."""
         with self._lock:
             self._episode = episode
 
@@ -73,7 +68,6 @@ class Player:
                 self._at, self._dirty = min(max(rows, 0.0), len(self._episode) - 1.0), True
 
     def play(self) -> None:
-        """Play from the present moment."""
         with self._lock:
             if self._episode is not None:
                 self.playing, self._dirty = True, True
@@ -88,12 +82,10 @@ class Player:
             self.playing, self._dirty = not self.playing, True
 
     def pause(self) -> None:
-        """Pause."""
         with self._lock:
             self.playing, self._dirty = False, True
 
     def refresh(self) -> None:
-        """Draw the present moment again."""
         with self._lock:
             self._dirty = True
 
@@ -163,7 +155,6 @@ class Worker:
             self._ready.notify()
 
     def stop(self) -> None:
-        """End the thread."""
         with self._ready:
             self._done, self._newest = True, self._newest + 1
             self._ready.notify()

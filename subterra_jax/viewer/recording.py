@@ -41,69 +41,42 @@ class EpisodeFileError(ViewerError):
 
 @dataclasses.dataclass(frozen=True)
 class Recording:
-    """An episode so far. Row 0 of a series is the start, row t comes after step t.
+    """An episode so far. Row 0 of a series is the start, row t comes after step t."""
 
-    Attributes:
-        task: Id of the task.
-        agent: Name of the driver.
-        tunnel: Name of the tunnel in the viewer's list.
-        tunnel_sha256: Digest of the tunnel, from `tunnel_digest`.
-        lining: Variant of the walls.
-        seed: Seed of the episode.
-        period: Control period, s.
-        radius: Radius of the robot, m.
-        range_max: Range of a beam that hits nothing, m.
-        length: Length of the driven piece of tunnel, m.
-        start: Station at which the robot believes to start, m.
-        goal: Station of the goal, m; NaN without a goal.
-        success: 1 if the task was achieved, else 0.
-        contact: 1 if the episode ended at a wall or an obstacle, else 0.
-        position: True position, tunnel frame, m.
-        heading: True heading, rad.
-        station: True station, m.
-        odometry: Dead-reckoned distance (m) and heading (rad) as observed.
-        ranges: LiDAR ranges as observed, m.
-        command: Speed (m/s) and yaw rate (rad/s) that led here; 0 in row 0.
-        estimate: Estimated station and its standard deviation, m; NaN without an estimate, and in row 0.
-        reward: Reward of the step that led here.
-        coverage: Share of the tunnel covered.
-        cloud: Some of the agent's particles: station and lateral offset, m, and weight over the mean weight; `k` is 0
-            without a particle filter.
-        boxes: Obstacles: middle x, y (m), unit vector along the first side, half sides (m).
-        trunk: Height of a walking robot's trunk, tunnel frame, m; 0 for wheeled robots.
-        pose: Orientation w, x, y, z and joints (rad) of a walking robot at even times up to this row, the last at the
-            row itself; `m` is 0 for wheeled robots.
-        points: Returns of a LiDAR in three dimensions in the robot's frame on the ground, m, some of them where it has
-            many beams; NaN without a return. `p` is 0 for a planar LiDAR.
-    """
-
-    task: str
-    agent: str
-    tunnel: str
-    tunnel_sha256: str
-    lining: str
-    seed: float
-    period: float
-    radius: float
-    range_max: float
-    length: float
-    start: float
-    goal: float
-    success: float
-    contact: float
-    position: Float[np.ndarray, "t 2"]
-    heading: Float[np.ndarray, "t"]
-    station: Float[np.ndarray, "t"]
-    odometry: Float[np.ndarray, "t 2"]
-    ranges: Float[np.ndarray, "t n_beams"]
-    command: Float[np.ndarray, "t 2"]
+    task: str  # id of the task
+    agent: str  # name of the driver
+    tunnel: str  # name of the tunnel in the viewer's list
+    tunnel_sha256: str  # digest of the tunnel, from `tunnel_digest`
+    lining: str  # variant of the walls
+    seed: float  # seed of the episode
+    period: float  # control period, s
+    radius: float  # radius of the robot, m
+    range_max: float  # range of a beam that hits nothing, m
+    length: float  # length of the driven piece of tunnel, m
+    start: float  # station at which the robot believes to start, m
+    goal: float  # station of the goal, m; NaN without a goal
+    success: float  # 1 if the task was achieved, else 0
+    contact: float  # 1 if the episode ended at a wall or an obstacle, else 0
+    position: Float[np.ndarray, "t 2"]  # true position, tunnel frame, m
+    heading: Float[np.ndarray, "t"]  # true heading, rad
+    station: Float[np.ndarray, "t"]  # true station, m
+    odometry: Float[np.ndarray, "t 2"]  # dead-reckoned distance (m) and heading (rad) as observed
+    ranges: Float[np.ndarray, "t n_beams"]  # LiDAR ranges as observed, m
+    command: Float[np.ndarray, "t 2"]  # speed (m/s) and yaw rate (rad/s) that led here; 0 in row 0
+    # estimated station and its standard deviation, m; NaN without an estimate, and in row 0
     estimate: Float[np.ndarray, "t 2"]
-    reward: Float[np.ndarray, "t"]
-    coverage: Float[np.ndarray, "t"]
+    reward: Float[np.ndarray, "t"]  # reward of the step that led here
+    coverage: Float[np.ndarray, "t"]  # share of the tunnel covered
+    # some of the agent's particles: station and lateral offset, m, and weight over the mean weight; `k` is 0 without a
+    # particle filter
     cloud: Float[np.ndarray, "t k 3"]
-    boxes: Float[np.ndarray, "b 6"]
-    trunk: Float[np.ndarray, "t"]
+    boxes: Float[np.ndarray, "b 6"]  # obstacles: middle x, y (m), unit vector along the first side, half sides (m)
+    trunk: Float[np.ndarray, "t"]  # height of a walking robot's trunk, tunnel frame, m; 0 for wheeled robots
+    # orientation w, x, y, z and joints (rad) of a walking robot at even times up to this row, the last at the row
+    # itself; `m` is 0 for wheeled robots
     pose: Float[np.ndarray, "t m 16"]
+    # Returns of a LiDAR in three dimensions in the robot's frame on the ground, m, some of them where it has many
+    # beams; NaN without a return. `p` is 0 for a planar LiDAR.
     points: Float[np.ndarray, "t p 3"]
 
     def __len__(self) -> int:
@@ -122,7 +95,6 @@ class Recording:
         return "_".join(plain) + ".npz"
 
     def extend(self, rows: dict[str, Any], success: float, contact: float) -> "Recording":
-        """Return the episode with further rows of every series."""
         series: dict[str, Any] = {name: np.concatenate([getattr(self, name), values]) for name, values in rows.items()}
         return dataclasses.replace(self, success=success, contact=contact, **series)
 

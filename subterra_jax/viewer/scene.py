@@ -69,7 +69,6 @@ class WheeledRobot:
         self.nodes = [scene.add_mesh_trimesh("/robot", mesh, cast_shadow=False)]
 
     def place(self, moment: Moment) -> None:
-        """Move the robot to its place at a moment."""
         self.nodes[0].position, self.nodes[0].wxyz = moment.position, quaternion_about_z(moment.heading)
 
 
@@ -114,7 +113,6 @@ class LeggedRobot:
         ]
 
     def place(self, moment: Moment) -> None:
-        """Move the robot to its place at a moment."""
         data = self._data
         data.qpos[:2], data.qpos[2], data.qpos[3:] = moment.position[:2], moment.trunk, moment.pose
         self._kinematics(self._model, data)

@@ -167,23 +167,19 @@ class Session:
             self.worker.submit(lambda stale: self.view.replay(replay))
 
     def stop(self) -> None:
-        """End the threads."""
         self.worker.stop()
         self.view.player.stop()
 
     def report_error(self, sentence: str) -> None:
-        """Show an error in every browser."""
         self.panel.status.content = f"**{sentence}**"
         for client in self._server.get_clients().values():
             client.add_notification("That did not work", sentence, color="red", auto_close_seconds=10.0)
 
     def drive(self) -> None:
-        """Drive the choice of the panel."""
         choice = self.panel.choice
         self.worker.submit(lambda stale: self.view.drive(choice, stale))
 
     def replay(self) -> None:
-        """Show the recorded episode that is chosen."""
         name = self.panel.recorded.value
         if name == NO_RECORDING:
             self.report_error("no episode has been recorded yet: press Save episode first")
@@ -281,7 +277,6 @@ class Viewer:
         self.session.start(replay)
 
     def stop(self) -> None:
-        """End the session and the server."""
         self.session.stop()
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()

@@ -58,55 +58,33 @@ Grid = Float[Array, "2 cells"]  # probability of an error of dead reckoning, in 
 
 @struct.dataclass
 class Hypothesis:
-    """Rings, station and grip, as one believes who began on dry rail, or on wet.
+    """Rings, station and grip, as one believes who began on dry rail, or on wet."""
 
-    Attributes:
-        base: Station less that of the start at the middle of the grid, m.
-        belief: Belief about the true station beyond it.
-        rate: Estimated relative error of dead reckoning, 1.
-        evidence: Log evidence, less that of the best hypothesis.
-        pattern: Pattern of the rings, the tunnel's left first.
-    """
-
-    base: Float[Array, "*bank"]
-    belief: Float[Array, "*bank 2 cells"]
-    rate: Float[Array, "*bank"]
-    evidence: Float[Array, "*bank"]
-    pattern: Pattern
+    base: Float[Array, "*bank"]  # station less that of the start at the middle of the grid, m
+    belief: Float[Array, "*bank 2 cells"]  # belief about the true station beyond it
+    rate: Float[Array, "*bank"]  # estimated relative error of dead reckoning, 1
+    evidence: Float[Array, "*bank"]  # log evidence, less that of the best hypothesis
+    pattern: Pattern  # pattern of the rings, the tunnel's left first
 
 
 @struct.dataclass
 class Estimate:
-    """Estimate of a hypothesis.
+    """Estimate of a hypothesis."""
 
-    Attributes:
-        station: Station less that of the start, m: the present one, past the delay of observations.
-        spread: Standard deviation of the station, m.
-        strength: Clarity of the pattern, from 0, no pattern, to 1.
-        wet: Probability of wet rail.
-    """
-
-    station: Float[Array, "*bank"]
-    spread: Float[Array, "*bank"]
-    strength: Float[Array, "*bank"]
-    wet: Float[Array, "*bank"]
+    station: Float[Array, "*bank"]  # station less that of the start, m: the present one, past the delay of observations
+    spread: Float[Array, "*bank"]  # standard deviation of the station, m
+    strength: Float[Array, "*bank"]  # clarity of the pattern, from 0, no pattern, to 1
+    wet: Float[Array, "*bank"]  # probability of wet rail
 
 
 @struct.dataclass
 class RingTrack:
-    """Estimate by the rings.
+    """Estimate by the rings."""
 
-    Attributes:
-        walls: The tracked walls.
-        driven: Distance driven, m.
-        bank: The hypotheses: the first began on dry rail, the second, if any, on wet.
-        estimate: Estimate of the best; its spread is that of all.
-    """
-
-    walls: Walls
-    driven: Float[Array, ""]
-    bank: Hypothesis
-    estimate: Estimate
+    walls: Walls  # the tracked walls
+    driven: Float[Array, ""]  # distance driven, m
+    bank: Hypothesis  # the hypotheses: the first began on dry rail, the second, if any, on wet
+    estimate: Estimate  # estimate of the best; its spread is that of all
 
 
 def start(n_beams: int, wet: bool = True) -> RingTrack:
@@ -176,7 +154,6 @@ def advance(
 
 
 def _advance_one(now: Hypothesis, bumps: Bumps, drive: _Drive, n_beams: int) -> tuple[Hypothesis, Estimate]:
-    """A hypothesis after a step and a scan, and its estimate."""
     cell = drive.pitch / PHASES
     driven = drive.direction * drive.step * (1.0 + now.rate)
     base = now.base + driven
@@ -229,21 +206,13 @@ def correct(belief: Grid, log_likelihood: Float[Array, "phases"]) -> tuple[Grid,
 
 @struct.dataclass
 class BeliefSummary:
-    """Estimates by a belief, in cells and shares.
+    """Estimates by a belief, in cells and shares."""
 
-    Attributes:
-        error: Mean within half a ring of the likeliest cell, cells.
-        spread: Standard deviation of the whole belief, cells.
-        sharpness: Certainty of the phase: 1 known, 0 unknown.
-        wet: Probability of wet rail.
-        dry_error: Mean for dry rail, cells.
-    """
-
-    error: Float[Array, ""]
-    spread: Float[Array, ""]
-    sharpness: Float[Array, ""]
-    wet: Float[Array, ""]
-    dry_error: Float[Array, ""]
+    error: Float[Array, ""]  # mean within half a ring of the likeliest cell, cells
+    spread: Float[Array, ""]  # standard deviation of the whole belief, cells
+    sharpness: Float[Array, ""]  # certainty of the phase: 1 known, 0 unknown
+    wet: Float[Array, ""]  # probability of wet rail
+    dry_error: Float[Array, ""]  # mean for dry rail, cells
 
 
 def summarise(belief: Grid) -> BeliefSummary:
@@ -273,30 +242,19 @@ def _take(values: Float[Array, "*mode cells"], cells: Array) -> Float[Array, "*m
 
 @struct.dataclass
 class RingMemory:
-    """Memory of the ring filter.
+    """Memory of the ring filter."""
 
-    Attributes:
-        start: Believed station of the start, m, and its standard deviation.
-        track: The rings.
-        reckoning: Dead reckoning, with the delay of observations.
-        fused: Estimate by commands and odometry.
-    """
-
-    start: Float[Array, "2"]
-    track: RingTrack
-    reckoning: Reckoning
-    fused: Belief
+    start: Float[Array, "2"]  # believed station of the start, m, and its standard deviation
+    track: RingTrack  # the rings
+    reckoning: Reckoning  # dead reckoning, with the delay of observations
+    fused: Belief  # estimate by commands and odometry
 
 
 @struct.dataclass
 class RingFilter(Localiser):
-    """Counts rings where the walls have any, on wet rail too, and falls back on commands and odometry elsewhere.
+    """Counts rings where the walls have any, on wet rail too, and falls back on commands and odometry elsewhere."""
 
-    Attributes:
-        wet: Whether the task may have wet rail, as its params say.
-    """
-
-    wet: bool = struct.field(pytree_node=False, default=True)
+    wet: bool = struct.field(pytree_node=False, default=True)  # whether the task may have wet rail, as its params say
 
     def begin(self, obs: Observed, params: EnvParams) -> RingMemory:
         believed = jnp.stack([jnp.asarray(value, jnp.float32) for value in believed_start(obs, params)])

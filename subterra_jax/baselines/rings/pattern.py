@@ -24,17 +24,12 @@ Waves = Complex[Array, "2 side harmonics"]
 
 @struct.dataclass
 class Pattern:
-    """A pattern as it was learnt.
+    """A pattern as it was learnt."""
 
-    Attributes:
-        harmonics: Harmonics of each wall, m; the left wall first, of the tunnel or of the robot.
-        seen: Number of scans from which it was learnt.
-        noise: Mean square of the residual of a scan, m².
-    """
-
+    # harmonics of each wall, m; the left wall first, of the tunnel or of the robot
     harmonics: Complex[Array, "2 harmonics"]
-    seen: Float[Array, ""]
-    noise: Float[Array, ""]
+    seen: Float[Array, ""]  # number of scans from which it was learnt
+    noise: Float[Array, ""]  # mean square of the residual of a scan, m²
 
     def facing(self, direction: Float[Array, ""]) -> "Pattern":
         """Exchange left and right of the tunnel for those of the robot, or back: they differ where direction is -1."""

@@ -33,21 +33,13 @@ _USUAL = 0.01  # gain of the usual distance beyond the walls, per usual step of 
 
 @struct.dataclass
 class Walls:
-    """The tracked walls.
+    """The tracked walls."""
 
-    Attributes:
-        distance: Distance of each wall, m; left first.
-        slope: Slope of both walls against the heading, 1.
-        bend: Curvature of both walls, 1/m.
-        scans: Number of scans in which they were seen.
-        usual: Average distance of each side beam's end beyond the walls, m.
-    """
-
-    distance: Float[Array, "2"]
-    slope: Float[Array, ""]
-    bend: Float[Array, ""]
-    scans: Float[Array, ""]
-    usual: Float[Array, "2 side"]
+    distance: Float[Array, "2"]  # distance of each wall, m; left first
+    slope: Float[Array, ""]  # slope of both walls against the heading, 1
+    bend: Float[Array, ""]  # curvature of both walls, 1/m
+    scans: Float[Array, ""]  # number of scans in which they were seen
+    usual: Float[Array, "2 side"]  # average distance of each side beam's end beyond the walls, m
 
     def at(self, along: Float[Array, "2 side"]) -> Float[Array, "2 side"]:
         """Return the distance of each wall at distances ahead, m."""
@@ -60,18 +52,13 @@ _SIGN = np.array([[1.0], [-1.0]], np.float32)
 
 @struct.dataclass
 class Bumps:
-    """Relief of the walls in one scan: side beams, left and then right, from the front to the back.
+    """Relief of the walls in one scan: side beams, left and then right, from the front to the back."""
 
-    Attributes:
-        height: Distance of each beam's end beyond the wall, m; 0 where the beam is not used. In a tracked scan, also
-            less the usual.
-        along: Distance of its end ahead of the robot, m.
-        valid: Whether the beam is used.
-    """
-
+    # Distance of each beam's end beyond the wall, m; 0 where the beam is not used. In a tracked scan, also less the
+    # usual.
     height: Float[Array, "2 side"]
-    along: Float[Array, "2 side"]
-    valid: Bool[Array, "2 side"]
+    along: Float[Array, "2 side"]  # distance of its end ahead of the robot, m
+    valid: Bool[Array, "2 side"]  # whether the beam is used
 
 
 def begin_walls(n_beams: int) -> Walls:

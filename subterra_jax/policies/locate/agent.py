@@ -28,33 +28,25 @@ ERRANDS = ("stop", "return")
 
 @struct.dataclass
 class Locating(Localised):
-    """Drives to a goal by a learnt localiser.
-
-    Attributes:
-        tensors: Weights by name, parts of the name between dots.
-        low: Smallest action, m/s and rad/s.
-        high: Largest action, m/s and rad/s.
-        speed: Speed at which it drives at most, m/s; None is that of the vehicle.
-        name: Name on the leaderboard.
-        conditions: Conditions of its training; None: any.
-    """
+    """Drives to a goal by a learnt localiser."""
 
     kind: ClassVar[str] = KIND
     prefix: ClassVar[str] = ""
     learns_errand: ClassVar[bool] = False
-    tensors: Tensors
-    low: Float[Array, "2"]
-    high: Float[Array, "2"]
+    tensors: Tensors  # weights by name, parts of the name between dots
+    low: Float[Array, "2"]  # smallest action, m/s and rad/s
+    high: Float[Array, "2"]  # largest action, m/s and rad/s
+    # speed at which it drives at most, m/s; None is that of the vehicle
     speed: float | None = struct.field(pytree_node=False, default=None)
     map: MapStrip | None = None
     hides_map: bool = struct.field(pytree_node=False, default=False)
     blind: bool = struct.field(pytree_node=False, default=False)
-    name: str = struct.field(pytree_node=False, default=KIND)
+    name: str = struct.field(pytree_node=False, default=KIND)  # name on the leaderboard
+    # conditions of its training; None: any
     conditions: Conditions | None = struct.field(pytree_node=False, default=None)
 
     @classmethod
     def of_layout(cls, layout: Mapping[str, Any], **common: Any) -> "Locating":
-        """Makes the agent of a layout, with `speed` if it has one."""
         speed = layout.get("speed")
         return cls(**common, speed=None if speed is None else float(speed))
 
@@ -70,7 +62,6 @@ class Locating(Localised):
             raise PolicyError(f"{source}: needs 16 level beams or a multiple of them, {env.id} has {n}")
 
     def begin(self, key: PRNGKeyArray, obs: Observed, params: EnvParams) -> Memory:
-        """Begins at the believed start."""
         return self._navigator(params).begin(key, obs, params)
 
     def act(

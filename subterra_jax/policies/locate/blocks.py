@@ -10,32 +10,21 @@ _SLOWEST = 25.0  # steps in a metre; more count as so many, since nobody drives 
 
 @struct.dataclass
 class Block:
-    """One metre of commanded distance.
+    """One metre of commanded distance."""
 
-    Attributes:
-        evidence: Log likelihood of each error compared, by the block `DELAY` metres ago; 0 where there is none.
-        read: Distance that the odometer counted in this metre, less 1, m.
-        steps: Steps taken in this metre.
-    """
-
+    # log likelihood of each error compared, by the block `DELAY` metres ago; 0 where there is none
     evidence: Float[Array, "n_shares"]
-    read: Float[Array, ""]
-    steps: Float[Array, ""]
+    read: Float[Array, ""]  # distance that the odometer counted in this metre, less 1, m
+    steps: Float[Array, ""]  # steps taken in this metre
 
 
 @struct.dataclass
 class Estimate:
-    """Answer of a memory.
+    """Answer of a memory."""
 
-    Attributes:
-        correction: True less commanded distance since the start, m.
-        share: The same for the metres to come, m per m.
-        log_scale: Log of the mean absolute error of `correction` that is expected, m.
-    """
-
-    correction: Float[Array, ""]
-    share: Float[Array, ""]
-    log_scale: Float[Array, ""]
+    correction: Float[Array, ""]  # true less commanded distance since the start, m
+    share: Float[Array, ""]  # the same for the metres to come, m per m
+    log_scale: Float[Array, ""]  # log of the mean absolute error of `correction` that is expected, m
 
 
 def matched_inputs(block: Block, shares: Float[Array, "n_shares"]) -> Float[Array, "n"]:

@@ -22,55 +22,33 @@ _STEP = 1.0  # m; no step is longer
 
 @struct.dataclass
 class LocatorMemory:
-    """Memory of a learnt localiser.
+    """Memory of a learnt localiser."""
 
-    Attributes:
-        begin: Believed station of the start, m.
-        driven: Commanded distance along the axis, m.
-        reading: Last reading of the odometer, m.
-        steps: Steps so far.
-        metres: Metres completed.
-        read_before: Reading at the end of the last metre, m, interpolated.
-        steps_before: Steps at that time, interpolated.
-        bend: Curvature of the tunnel, 1/m.
-        window: Profiles about the robot.
-        cell: Memory behind the front end.
-        estimate: Its last answer, with what the map tells.
-        belief: Belief of the filter that takes a map; None without one.
-        passed: Correction of the metres that all beams have passed, without the map, m.
-    """
-
-    begin: Float[Array, ""]
-    driven: Float[Array, ""]
-    reading: Float[Array, ""]
-    steps: Float[Array, ""]
-    metres: Int[Array, ""]
-    read_before: Float[Array, ""]
-    steps_before: Float[Array, ""]
-    bend: Float[Array, ""]
-    window: Profiles
-    cell: Any
-    estimate: Estimate
-    belief: map_filter.MapBelief | None
-    passed: Float[Array, ""]
+    begin: Float[Array, ""]  # believed station of the start, m
+    driven: Float[Array, ""]  # commanded distance along the axis, m
+    reading: Float[Array, ""]  # last reading of the odometer, m
+    steps: Float[Array, ""]  # steps so far
+    metres: Int[Array, ""]  # metres completed
+    read_before: Float[Array, ""]  # reading at the end of the last metre, m, interpolated
+    steps_before: Float[Array, ""]  # steps at that time, interpolated
+    bend: Float[Array, ""]  # curvature of the tunnel, 1/m
+    window: Profiles  # profiles about the robot
+    cell: Any  # memory behind the front end
+    estimate: Estimate  # its last answer, with what the map tells
+    belief: map_filter.MapBelief | None  # belief of the filter that takes a map; None without one
+    passed: Float[Array, ""]  # correction of the metres that all beams have passed, without the map, m
 
 
 @struct.dataclass
 class Locator(Localiser):
-    """Estimates the station by commands, corrected by what it has learnt of the walls.
+    """Estimates the station by commands, corrected by what it has learnt of the walls."""
 
-    Attributes:
-        weights: As `memory.init` makes them, trained.
-        map: The map; None has none.
-        blind: Leave the evidence out: the ablation that shows what the walls tell.
-    """
-
-    weights: Any
-    map: MapStrip | None = None
+    weights: Any  # as `memory.init` makes them, trained
+    map: MapStrip | None = None  # the map; None has none
+    # leave the evidence out: the ablation that shows what the walls tell
     blind: bool = struct.field(pytree_node=False, default=False)
 
     def begin(self, obs: Observed, params: Any) -> LocatorMemory:
-        """Begins at the believed start."""
         zero = jnp.zeros(())
         start, sigma = believed_start(obs, params)
         return LocatorMemory(

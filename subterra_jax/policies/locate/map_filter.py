@@ -46,15 +46,10 @@ _TO_MEAN_ABSOLUTE = float(np.sqrt(2.0 / np.pi))
 
 @struct.dataclass
 class MapBelief:
-    """Memory of the filter.
+    """Memory of the filter."""
 
-    Attributes:
-        share: Probability of each of `SHIFTS`, if the map is of this tunnel.
-        log_odds: Log odds that it is.
-    """
-
-    share: Float[Array, "n_shifts"]
-    log_odds: Float[Array, ""]
+    share: Float[Array, "n_shifts"]  # probability of each of `SHIFTS`, if the map is of this tunnel
+    log_odds: Float[Array, ""]  # log odds that it is
 
 
 def init(key: PRNGKeyArray) -> Weights:

@@ -17,19 +17,13 @@ _FINE = 5  # cells of the wall map in one bin
 
 @struct.dataclass
 class MapStrip:
-    """Walls of one tunnel, or of the tunnels of a stack one after another.
+    """Walls of one tunnel, or of the tunnels of a stack one after another."""
 
-    Attributes:
-        wall: Distance of the left and of the right wall from the centreline in each bin of station, m.
-        first_bin: First bin of each tunnel.
-        n_bins: Bins of each tunnel.
-        first_node: First node of each tunnel in its stack, by which `pick` knows it.
-    """
-
+    # distance of the left and of the right wall from the centreline in each bin of station, m
     wall: Float[Array, "2 all_bins"]
-    first_bin: Int[Array, "*k"]
-    n_bins: Int[Array, "*k"]
-    first_node: Int[Array, "*k"]
+    first_bin: Int[Array, "*k"]  # first bin of each tunnel
+    n_bins: Int[Array, "*k"]  # bins of each tunnel
+    first_node: Int[Array, "*k"]  # first node of each tunnel in its stack, by which `pick` knows it
 
     def pick(self, index: Int[Array, ""]) -> "MapStrip":
         """Returns the strip of one tunnel by its number."""
@@ -37,7 +31,6 @@ class MapStrip:
         return dataclasses.replace(self, **numbers)
 
     def of(self, tunnel: Tunnel) -> "MapStrip":
-        """Returns the strip of the tunnel that a robot is in."""
         return self.pick(jnp.argmax(self.first_node == tunnel.first_node))
 
     def sample(self, start: Float[Array, ""], n: int) -> tuple[Float[Array, "2 n"], Bool[Array, "n"]]:

@@ -19,17 +19,11 @@ _UNIT = 0.02  # of the speed: answers of order 1
 
 @struct.dataclass
 class Sums:
-    """Memory of the network.
+    """Memory of the network."""
 
-    Attributes:
-        cell: Memory of the transformer.
-        correction: Sum of its answers for the metres that all beams have passed, m.
-        age: Metres so far.
-    """
-
-    cell: Any
-    correction: Float[Array, ""]
-    age: Float[Array, ""]
+    cell: Any  # memory of the transformer
+    correction: Float[Array, ""]  # sum of its answers for the metres that all beams have passed, m
+    age: Float[Array, ""]  # metres so far
 
 
 def init(front: str, key: PRNGKeyArray, with_map: bool = False) -> Weights:

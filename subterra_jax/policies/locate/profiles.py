@@ -26,38 +26,25 @@ class Points:
 
     Of a LiDAR in three dimensions there are further sides, left and right at other heights (`strips`), and `rays` rows
     of points for each.
-
-    Attributes:
-        along: Distance ahead, m.
-        out: Distance beyond the tracked wall, m.
-        seen: True where there is a point.
-        rays: Rows of points that belong to one side.
     """
 
-    along: Float[Array, "row 7"]
-    out: Float[Array, "row 7"]
-    seen: Bool[Array, "row 7"]
-    rays: int = struct.field(pytree_node=False, default=1)
+    along: Float[Array, "row 7"]  # distance ahead, m
+    out: Float[Array, "row 7"]  # distance beyond the tracked wall, m
+    seen: Bool[Array, "row 7"]  # true where there is a point
+    rays: int = struct.field(pytree_node=False, default=1)  # rows of points that belong to one side
 
     @property
     def n_sides(self) -> int:
-        """Number of sides."""
         return self.seen.shape[-2] // self.rays
 
 
 @struct.dataclass
 class Profiles:
-    """Weighted sums of points by bin.
+    """Weighted sums of points by bin."""
 
-    Attributes:
-        weight: Sum of weights.
-        out: Weighted sum of distances beyond the wall, m.
-        along: Weighted sum of distances ahead at which they were seen, m.
-    """
-
-    weight: Grid
-    out: Grid
-    along: Grid
+    weight: Grid  # sum of weights
+    out: Grid  # weighted sum of distances beyond the wall, m
+    along: Grid  # weighted sum of distances ahead at which they were seen, m
 
 
 def find_points(ranges: Float[Array, "n_beams"], walls: Corridor, range_max: Float[Array, ""] | float) -> Points:

@@ -15,17 +15,11 @@ _AFTER = 120  # bins behind the last metre
 
 @struct.dataclass
 class Record:
-    """A drive as its robot saw it.
+    """A drive as its robot saw it."""
 
-    Attributes:
-        driven: Commanded distance along the axis at each observation, m; never falls.
-        read: Odometer, m.
-        points: Points on the walls.
-    """
-
-    driven: Float[Array, "time"]
-    read: Float[Array, "time"]
-    points: Points
+    driven: Float[Array, "time"]  # commanded distance along the axis at each observation, m; never falls
+    read: Float[Array, "time"]  # odometer, m
+    points: Points  # points on the walls
 
 
 def metres(record: Record, weights: matching.Weights, n: int) -> Block:

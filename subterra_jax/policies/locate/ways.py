@@ -17,33 +17,21 @@ _FLAG_SIGMA = 0.1  # m
 
 @struct.dataclass
 class WayMemory:
-    """Memory of both ways.
+    """Memory of both ways."""
 
-    Attributes:
-        origin: Station at which this way began, m; while turning, the station.
-        direction: 1 on the way out, -1 on the way back.
-        turning: True from the flag until the robot has turned.
-        locator: Memory of this way.
-    """
-
-    origin: Float[Array, ""]
-    direction: Float[Array, ""]
-    turning: Bool[Array, ""]
-    locator: LocatorMemory
+    origin: Float[Array, ""]  # station at which this way began, m; while turning, the station
+    direction: Float[Array, ""]  # 1 on the way out, -1 on the way back
+    turning: Bool[Array, ""]  # true from the flag until the robot has turned
+    locator: LocatorMemory  # memory of this way
 
 
 @struct.dataclass
 class TwoWays(Localiser):
-    """Counts each way by a learnt localiser, which only knows driving forward.
+    """Counts each way by a learnt localiser, which only knows driving forward."""
 
-    Attributes:
-        locator: The localiser.
-    """
-
-    locator: Locator
+    locator: Locator  # the localiser
 
     def begin(self, obs: Observed, params: Any) -> WayMemory:
-        """Begins on the way out, at the believed start."""
         locator = self.locator.begin(obs, params)
         return WayMemory(locator.begin, jnp.ones(()), jnp.zeros((), bool), locator)
 
