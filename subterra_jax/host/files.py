@@ -1,9 +1,11 @@
 """Files and folders that appear whole or not at all, and early checks that they can be written."""
 
 import ctypes
+import glob
 import os
 import shutil
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -53,15 +55,15 @@ def replace_file(path: Path) -> Iterator[Path]:
     """Yields a temporary path to write, and renames it to `path` once the block ends without an error.
 
     A previous file at `path` stays whole until then. The folder is made where it is missing. After an error or an
-    interrupt, nothing of the new file is left.
+    interrupt, nothing of the new file is left. Of several processes that write the same file, the last one's stays.
 
     Raises:
         OutputError: The disk refuses.
     """
-    fresh = path.with_name(f".{path.name}.partial")
+    fresh = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        fresh.unlink(missing_ok=True)
+        _remove_forgotten(path)
         yield fresh
         fresh.replace(path)
     except OSError as error:
@@ -96,6 +98,14 @@ def replace_folder(path: Path) -> Iterator[Path]:
     finally:
         shutil.rmtree(fresh, ignore_errors=True)
         _put_back(path, stale)
+
+
+def _remove_forgotten(path: Path) -> None:
+    """Removes what killed processes left of a file; nothing is written for a day."""
+    for left in path.parent.glob(f".{glob.escape(path.name)}.*.partial"):
+        with suppress(OSError):
+            if left.stat().st_mtime < time.time() - 86_400:
+                left.unlink()
 
 
 def _remove(path: Path) -> None:

@@ -1,8 +1,11 @@
 """Host plumbing: command lines, exit statuses, files that appear whole or not at all, and the lazy package."""
 
 import dataclasses
+import os
 import pickle
 import pkgutil
+import subprocess
+import sys
 
 import pytest
 import tyro
@@ -92,6 +95,7 @@ def test_a_mistake_is_one_sentence_and_status_2(capsys, words, sentence):
 @pytest.mark.parametrize("command", [build_command, SurveyConfig])
 def test_the_help_of_this_room_fits_a_screen_and_has_an_example(capsys, monkeypatch, command):
     monkeypatch.setenv("COLUMNS", "100")
+    monkeypatch.setattr(sys, "argv", ["build"])  # the usage begins with it, and pytest's own path fills a line
     with pytest.raises(SystemExit):
         parse(lambda words: tyro.cli(command, args=words), ["--help"])
     lines = capsys.readouterr().out.splitlines()
@@ -148,6 +152,30 @@ def test_a_file_is_replaced_whole_or_not_at_all(tmp_path):
         interrupt_while_writing(fresh)
     assert path.read_text() == "first"
     assert list(path.parent.iterdir()) == [path]
+
+
+def test_two_processes_may_write_the_same_file(tmp_path):
+    path = tmp_path / "file.txt"
+    other = "import sys; from pathlib import Path; from subterra_jax.host.files import replace_file\n"
+    other += "with replace_file(Path(sys.argv[1])) as fresh: fresh.write_text('other')"
+    with replace_file(path) as fresh:
+        fresh.write_text("own")
+        subprocess.run([sys.executable, "-c", other, str(path)], check=True)
+        assert path.read_text() == "other"
+    assert path.read_text() == "own"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_what_a_killed_process_left_of_a_file_goes_after_a_day(tmp_path):
+    path = tmp_path / "file.txt"
+    old, young = tmp_path / ".file.txt.1.partial", tmp_path / ".file.txt.2.partial"
+    for left in (old, young):
+        left.write_text("half")
+    os.utime(old, (0, 0))
+    with replace_file(path) as fresh:
+        fresh.write_text("whole")
+    assert not old.exists()
+    assert young.exists()
 
 
 def test_a_file_that_cannot_be_written_is_named(tmp_path):
