@@ -53,7 +53,7 @@ class TrainConfig:
         steps: Environment steps to train for, all environments together; rounded up to whole iterations.
         memory: `none`; `stack`: the last `frames` observations; `gru`: a network that remembers; `along`: the learnt
             localiser, which looks along the metres that it has passed; `map`: a histogram filter on the map.
-        frames: Observations in the stack.
+        frames: Observations that the network sees at once.
         cell: Width of the GRU.
         auxiliary: Learn what only the simulator knows as well: with `gru` the error of the way to go, with `along` the
             true station. It is a target and never an input.
@@ -97,7 +97,7 @@ class TrainConfig:
     seed: int = 0
     steps: int = 1_500_000
     memory: Literal["none", "stack", "gru", "along", "map"] = "none"
-    frames: int = 4
+    frames: int = 1
     cell: int = 128
     auxiliary: bool = False
     map_cell: float = 0.25
@@ -180,7 +180,7 @@ _COVER = {"stop_coverage": 0.9}
 _CPU_GOAL: dict[str, Any] = {"steps": 2_500_000, "standing": 1.0, "init_std": 0.3, "last_rate": 0.05}
 # Settings that some memories read and others do not.
 _READ_BY: dict[str, tuple[str, ...]] = {
-    "frames": ("stack",),
+    "frames": ("stack", "along"),
     "cell": ("gru",),
     "auxiliary": ("gru", "along"),
     "auxiliary_weight": ("gru",),
@@ -203,7 +203,7 @@ def make_config(task: str, preset: str = "cpu", memory: str = "none") -> TrainCo
     known_preset(preset)
     if memory not in MEMORIES:
         raise ConfigError(f"unknown memory {memory!r}; there are {', '.join(MEMORIES)}")
-    settings: dict[str, Any] = {"memory": memory}
+    settings: dict[str, Any] = {"memory": memory} | ({"frames": 4} if memory == "stack" else {})
     if preset == "gpu":
         settings |= {**_GPU, **_BY_MEMORY.get(memory, {})}
     if task in TASKS:
@@ -246,6 +246,8 @@ def check(config: TrainConfig) -> TrainConfig:
                 f"{name} = {getattr(config, name)} is for memory = {' or '.join(memories)}, "
                 f"and memory = {config.memory} does not read it"
             )
+    if config.memory == "along" and config.auxiliary and config.frames > 1:
+        raise ConfigError(f"frames = {config.frames} is for a localiser that is given, and auxiliary = True learns it")
     if config.map and config.front != "match":
         raise ConfigError(f"map = True is for front = match, and front = {config.front}")
     positive(config, "map_cell", "localiser_rate", "learning_rate", "init_std", "max_grad_norm", "clip")

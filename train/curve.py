@@ -1,13 +1,16 @@
 """The learning curve of one or several runs: `python -m train.curve RUN [RUN ...] --out curve.png`.
 
 Of the paper's task the rolling hundred's coverage and success against finished episodes, as in its Fig. 4; of the tasks
-that end at a goal, success against episodes and against steps.
+that end at a goal, success against steps and against seconds.
 """
 
 import dataclasses
 import json
 import sys
+from collections.abc import Mapping
+from itertools import cycle
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import matplotlib
@@ -17,12 +20,13 @@ import tyro
 from subterra_jax.host.command import parse, run_command
 from subterra_jax.host.files import replace_file, require_file
 from train.folder import RunFolderError
-from train.log import EPISODES
+from train.log import EPISODES, read_log
 from train.snapshot import WINDOW
 
 GOAL = 0.9
 _COLUMNS = "episode,step,coverage_mean_100,success_mean_100"
-_EPISODE, _STEP = "finished episodes", "environment steps, millions"
+_EPISODE, _STEP, _SECOND = "finished episodes", "environment steps, millions", "seconds, with compiling"
+_AGAINST = {_EPISODE: ("episode", 1.0), _STEP: ("step", 1e6), _SECOND: ("second", 1.0)}
 _POINTS = 4000  # of one line in the figure
 Curve = dict[str, np.ndarray]
 
@@ -50,12 +54,13 @@ def rolling(values: np.ndarray, window: int = WINDOW) -> np.ndarray:
     return (total[end] - total[begin]) / (end - begin)
 
 
-def write_curve(runs: list[Path], png: Path) -> None:
+def write_curve(runs: list[Path], png: Path, lines: Mapping[str, float] = MappingProxyType({})) -> None:
     """Draws the rolling hundred of every run, mean ± standard deviation over several, and writes its numbers.
 
     Args:
         runs: Run folders; each gets a `curve.csv` of its own.
         png: File of the figure.
+        lines: Shares to draw as lines through it, by what they are called.
 
     Raises:
         RunFolderError: One of them cannot be read; nothing is drawn then.
@@ -63,15 +68,17 @@ def write_curve(runs: list[Path], png: Path) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    curves, shown = [_curve(read_episodes(run)) for run in runs], measure(runs[0])
+    curves, shown = [_curve(run) for run in runs], measure(runs[0])
     for run, curve in zip(runs, curves, strict=True):
         _write_table(run, curve)
     figure, panels = pyplot.subplots(1, 2, figsize=(10.0, 4.0), sharey=True, layout="constrained")
-    wanted = [("coverage", _EPISODE), ("success", _EPISODE if shown == "coverage" else _STEP)]
-    for axes, (column, against) in zip(panels, wanted, strict=True):
-        name = column if shown == "coverage" else shown
+    paper = [("coverage", _EPISODE), ("success", _EPISODE)]
+    wanted = paper if shown == "coverage" else [("success", _STEP), ("success", _SECOND)]
+    for axes, (name, against) in zip(panels, wanted, strict=True):
+        for (label, share), style in zip(lines.items(), cycle((":", "-.", "--"))):
+            axes.axhline(100.0 * share, ls=style, lw=1.2, color="0.3", zorder=2, label=f"{label}, {100.0 * share:g} %")
         _draw(axes, [run.resolve().name for run in runs], curves, name, against)
-    panels[0].legend(loc="lower right", fontsize=8)
+    panels[0].legend(loc="lower right" if shown == "coverage" else "center right", fontsize=8)
     with replace_file(png) as fresh:
         figure.savefig(fresh, dpi=120, format="png")
     pyplot.close(figure)
@@ -86,10 +93,13 @@ def measure(run: Path) -> str:
     return "coverage" if "Traverse" in task else "success"
 
 
-def _curve(rows: Curve) -> Curve:
-    """Returns episodes, steps, and the rolling means at each episode."""
+def _curve(run: Path) -> Curve:
+    """Returns episodes, steps, seconds, and the rolling means at each episode."""
+    rows, log = read_episodes(run), read_log(run)
     means = {name: rolling(rows[name]) for name in ("coverage", "success")}
-    return {"episode": rows["episode"], "step": rows["step"], **means, "single": rows["coverage"]}
+    seconds = [line["timing"]["seconds"] for line in log]
+    second = np.interp(rows["step"], [line["step"] for line in log], seconds) if log else rows["step"]
+    return {"episode": rows["episode"], "step": rows["step"], "second": second, **means, "single": rows["coverage"]}
 
 
 def _write_table(run: Path, curve: Curve) -> None:
@@ -101,7 +111,8 @@ def _write_table(run: Path, curve: Curve) -> None:
 def _draw(axes: Any, names: list[str], curves: list[Curve], name: str, against: str) -> None:
     """Draws one panel: a thin line for a run, and the band of several."""
     for label, curve in zip(names, curves, strict=True):
-        x = curve["episode"] if against == _EPISODE else curve["step"] / 1e6
+        column, unit = _AGAINST[against]
+        x = curve[column] / unit
         few = slice(None, None, max(1, len(x) // _POINTS))
         axes.plot(x[few], 100.0 * curve[name][few], lw=1.0, label=label, zorder=3)
         if len(curves) == 1 and name == "coverage":
@@ -134,10 +145,12 @@ class Command:
     Attributes:
         runs: Run folders.
         out: The figure.
+        lines: Shares to draw as lines, by name: `--lines floor 0.32 ceiling 0.997`.
     """
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
     out: Path = Path("curve.png")
+    lines: dict[str, float] = dataclasses.field(default_factory=dict)
 
 
 def command(arguments: Command) -> None:
@@ -145,7 +158,7 @@ def command(arguments: Command) -> None:
     if not arguments.runs:
         raise RunFolderError("no run folder was named")
     require_file(arguments.out, ".png")
-    write_curve(list(arguments.runs), arguments.out)
+    write_curve(list(arguments.runs), arguments.out, arguments.lines)
 
 
 def main() -> None:

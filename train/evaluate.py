@@ -18,6 +18,7 @@ from subterra_jax.policies.trained import Trained
 from train.config import ConfigError
 from train.log import print_table
 from train.policies import open_agent
+from train.without import Part, without
 from train.world import PLANAR, World, open_world
 
 _BATCH = 500
@@ -76,6 +77,8 @@ class Command:
         tunnel: Tunnel file or names, as in training; the packaged tunnel, or a few of `open:train`, if left out.
         lining: Variant of the walls; the tunnel's usual one if left out.
         episodes: Episodes to drive, the first of the task's 500.
+        without: Go without a part, for an ablation: the `start` is told 40 m off; `front`: the localiser reads no
+            walls; `walls`: no beam has an echo; `odometry` stands still; `memory`: the way is dead-reckoned.
         json: One line of JSON instead of a table.
     """
 
@@ -84,6 +87,7 @@ class Command:
     tunnel: Path | None = None
     lining: str | None = None
     episodes: int = N_LISTED
+    without: Part | None = None
     json: bool = False
 
 
@@ -95,6 +99,8 @@ def command(arguments: Command) -> None:
     world = open_world(arguments.task or facts["task"], arguments.tunnel, arguments.lining, sensor)
     source = arguments.policy or agent.name
     released.check_fits(agent, world.env, world.params, source)
+    if arguments.without is not None:
+        agent = without(agent, arguments.without)
     found = {**world.facts, **evaluate(world, agent, arguments.episodes)}
     if arguments.json:
         print(json.dumps(found))

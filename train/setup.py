@@ -41,7 +41,7 @@ def make_layout(env: Any, params: Any, config: TrainConfig, given: Given | None 
     Raises:
         ConfigError: A setting does not go with the task.
     """
-    kept = Memory(config.memory, config.frames if config.memory == "stack" else 1, config.map_cell)
+    kept = Memory(config.memory, config.frames, config.map_cell)
     flat, here = jax.ShapeDtypeStruct((env.observation_size(params),), np.float32), in_tunnel(env, params, 0)
 
     def look(flat: Any) -> Any:

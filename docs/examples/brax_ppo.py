@@ -4,8 +4,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from brax.envs.base import State, Wrapper
 from brax.training.agents.ppo import train as ppo
-from watch import Act, Watch
+from watch import Act, Watch, features
 
 from subterra_jax.adapters.brax import RescaleAction, SubterraBraxEnv, jax_for_brax, wrap
 
@@ -14,10 +15,33 @@ class _Enough(Exception):
     """The goal is reached."""
 
 
+class Look(Wrapper):
+    """Shows features in place of observations."""
+
+    def __init__(self, env: Any, look: Any) -> None:
+        super().__init__(env)
+        self.look = look
+
+    @property
+    def observation_size(self) -> int:
+        """Numbers in one observation."""
+        return jax.eval_shape(self.look, jax.ShapeDtypeStruct((self.env.observation_size,), jnp.float32)).shape[0]
+
+    def reset(self, rng: jax.Array) -> State:
+        """Begins an episode."""
+        state = self.env.reset(rng)
+        return state.replace(obs=self.look(state.obs))
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Drives one control period."""
+        state = self.env.step(state, action)
+        return state.replace(obs=self.look(state.obs))
+
+
 def train(watch: Watch, steps: int, seed: int) -> None:
     """Trains until the watch says enough."""
     env = SubterraBraxEnv(watch.task, **watch.options)
-    low, high = env.action_bounds
+    (low, high), see = env.action_bounds, features(env.env, env.params)
     act: Any = None
 
     def look(now: int, make_policy: Any, weights: Any) -> None:
@@ -25,7 +49,7 @@ def train(watch: Watch, steps: int, seed: int) -> None:
         if act is None:
 
             def act(weights: Any, obs: jax.Array) -> jax.Array:
-                action, _ = make_policy(weights, deterministic=True)(obs, jax.random.key(0))
+                action, _ = make_policy(weights, deterministic=True)(see(obs), jax.random.key(0))
                 return low + 0.5 * (jnp.clip(action, -1.0, 1.0) + 1.0) * (high - low)
 
         if now and watch(now, Act(act, weights)):
@@ -34,7 +58,7 @@ def train(watch: Watch, steps: int, seed: int) -> None:
     try:
         with jax_for_brax():
             ppo.train(
-                environment=RescaleAction(env),
+                environment=Look(RescaleAction(env), see),
                 wrap_env_fn=wrap,
                 episode_length=env.episode_length,
                 num_timesteps=steps,
@@ -45,7 +69,7 @@ def train(watch: Watch, steps: int, seed: int) -> None:
                 num_updates_per_batch=4,
                 learning_rate=1e-3,
                 entropy_cost=1e-3,
-                discounting=0.98,
+                discounting=0.997,
                 gae_lambda=0.95,
                 clipping_epsilon=0.2,
                 max_grad_norm=0.5,

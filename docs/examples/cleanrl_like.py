@@ -7,14 +7,15 @@ the last of an episode only resets; it is left out of the loss.
 from typing import Any
 
 import gymnasium
+import jax
 import numpy as np
 import torch
-from gymnasium.wrappers.vector import NormalizeObservation, NormalizeReward, RescaleAction
+from gymnasium.wrappers.vector import NormalizeObservation, NormalizeReward, RescaleAction, TransformObservation
 from torch import nn
-from watch import Act, OnHost, Watch
+from watch import Act, OnHost, Watch, features
 
 N_ENVS, N_STEPS, N_EPOCHS, N_MINIBATCHES = 64, 128, 4, 8
-LEARNING_RATE, DISCOUNT, GAE_LAMBDA, CLIP, ENTROPY = 1e-3, 0.98, 0.95, 0.2, 1e-3
+LEARNING_RATE, DISCOUNT, GAE_LAMBDA, CLIP, ENTROPY = 1e-3, 0.997, 0.95, 0.2, 1e-3
 
 
 def layer(n_in: int, n_out: int, gain: float) -> nn.Linear:
@@ -58,7 +59,11 @@ def train(watch: Watch, steps: int, seed: int) -> None:
         **watch.options,
     )
     one = np.ones(watch.env.action_size, np.float32)
-    envs = normal = NormalizeObservation(RescaleAction(envs, -one, one))
+    look = jax.jit(jax.vmap(features(watch.env, watch.params)))
+    n = look(envs.observation_space.sample()).shape[1]
+    spaces = [gymnasium.spaces.Box(-np.inf, np.inf, shape) for shape in ((N_ENVS, n), (n,))]
+    seen = TransformObservation(envs, lambda obs: np.asarray(look(obs)), *spaces)
+    envs = normal = NormalizeObservation(RescaleAction(seen, -one, one))
     envs = NormalizeReward(envs, gamma=DISCOUNT)
     low, high = watch.env.action_space(watch.params).low, watch.env.action_space(watch.params).high
     agent = Agent(envs.single_observation_space.shape[0], envs.single_action_space.shape[0])
@@ -69,7 +74,7 @@ def train(watch: Watch, steps: int, seed: int) -> None:
 
     @torch.no_grad()
     def act(obs: np.ndarray) -> np.ndarray:
-        action = agent.mean(normalised(obs)).clamp(-1.0, 1.0).numpy()
+        action = agent.mean(normalised(np.asarray(look(obs)))).clamp(-1.0, 1.0).numpy()
         return low + 0.5 * (action + 1.0) * (high - low)
 
     driver = Act(OnHost(act))

@@ -8,14 +8,38 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import rejax
-from watch import Act, Watch
+from gymnax.environments.spaces import Box
+from watch import Act, Watch, features
 
 from subterra_jax.adapters.gymnax import SubterraGymnax5
 
 
+class Seen(SubterraGymnax5):
+    """Shows features in place of observations."""
+
+    def __init__(self, task: str, **options: Any) -> None:
+        super().__init__(task, **options)
+        self.look = features(self.env, self.default_params)
+
+    def observation_space(self, params: Any = None) -> Box:
+        """Bounds of the features."""
+        n = jax.eval_shape(self.look, jax.ShapeDtypeStruct(super().observation_space(params).shape, jnp.float32))
+        return Box(-jnp.inf, jnp.inf, n.shape)
+
+    def reset(self, key: jax.Array, params: Any = None) -> Any:
+        """Begins an episode."""
+        obs, state = super().reset(key, params)
+        return self.look(obs), state
+
+    def step(self, key: jax.Array, state: Any, action: jax.Array, params: Any = None) -> Any:
+        """Drives one control period."""
+        obs, *rest = super().step(key, state, action, params)
+        return self.look(obs), *rest
+
+
 def train(watch: Watch, steps: int, seed: int) -> None:
     """Trains until the watch says enough."""
-    env = SubterraGymnax5(watch.task, **watch.options)
+    env = Seen(watch.task, **watch.options)
     trainer = rejax.PPO.create(
         env=env,
         env_params=env.default_params,
@@ -24,12 +48,12 @@ def train(watch: Watch, steps: int, seed: int) -> None:
         num_minibatches=8,
         num_epochs=4,
         learning_rate=1e-3,
-        gamma=0.98,
+        gamma=0.997,
         max_grad_norm=0.5,
         ent_coef=1e-3,
         normalize_observations=True,
         normalize_rewards=True,
-        reward_normalization_discount=0.98,
+        reward_normalization_discount=0.997,
         total_timesteps=8_192,  # of one call; the next one goes on from its state
         eval_freq=8_192,
         skip_initial_evaluation=True,
@@ -39,7 +63,7 @@ def train(watch: Watch, steps: int, seed: int) -> None:
 
     def act(state: Any, obs: jax.Array) -> jax.Array:
         actor, rms = state
-        obs = trainer.normalize_obs(rms, obs)
+        obs = trainer.normalize_obs(rms, env.look(obs))
         mean = trainer.actor.apply(actor, obs[None], method=_mean)[0]
         return jnp.clip(mean, low, high)
 

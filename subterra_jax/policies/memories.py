@@ -51,7 +51,7 @@ class Memory:
     """A choice of memory."""
 
     kind: str = "none"  # one of `MEMORIES`
-    frames: int = 1  # observations in the stack, the newest included; 1 but with `stack`
+    frames: int = 1  # observations in the stack, the newest included; 1 but with `stack`, `along`
     cell: float = 0.25  # length of a cell of the belief, m; for `map`
 
     @property

@@ -1,19 +1,23 @@
+import dataclasses
 import json
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 import subterra_jax as st
+from subterra_jax.baselines.agent import observed
 from subterra_jax.evaluation import evaluate as drive
 from subterra_jax.evaluation import listed_episodes
 from subterra_jax.rules import StartParams
 from tests.train.conftest import TASK, call
 from train import evaluate
-from train.config import TrainConfig
+from train.config import ConfigError, TrainConfig
 from train.driver import Driver, Policy
-from train.policies import make_agent
+from train.policies import make_agent, open_agent
 from train.setup import make_layout
+from train.without import without
 
 
 @pytest.fixture(scope="module")
@@ -96,3 +100,40 @@ def test_without_a_policy_or_a_task_nothing_can_be_scored(capsys):
 def test_a_policy_that_there_is_not_is_refused_with_those_there_are(capsys):
     assert call(evaluate.main, "--policy", "nobody") == 2
     assert "nobody: no such policy; released are" in capsys.readouterr().err
+
+
+def test_an_ablation_takes_away_what_it_names_and_nothing_else():
+    env, params = st.make("Subterra/StopAtShort-v1", tunnel="open:cast:train:0")
+    flat, _ = env.reset(jax.random.key(0), params)
+    begun = observed(env, params, flat)
+    obs = dataclasses.replace(begun, distance=begun.distance + 5.0)
+    driver = Driver(env, make_layout(env, params, TrainConfig(hidden=(4,))))
+    agent = make_agent(driver, Policy(driver.init(jax.random.PRNGKey(0))))
+
+    def reads(agent):
+        return np.asarray(agent.act(None, agent.begin(None, begun, params), obs, params, None)[1].kept.seen)
+
+    whole = reads(agent)
+    beams = slice(4, 4 + 2 * params.lidar.n_beams)
+    for part, places in (("start", range(4)), ("odometry", range(4)), ("walls", range(beams.start, beams.stop))):
+        changed = reads(without(agent, part)) != whole
+        assert changed[list(places)].any()
+        assert not np.delete(changed, list(places)).any()
+    assert 100.0 * (whole - reads(without(agent, "start")))[3] == pytest.approx(40.0, abs=1e-3)
+    assert 100.0 * (whole - reads(without(agent, "odometry")))[3] == pytest.approx(-5.0, abs=1e-3)
+    for part in ("front", "memory"):
+        with pytest.raises(ConfigError, match="to go without"):
+            without(agent, part)
+
+
+def test_without_its_localiser_a_policy_reads_the_dead_reckoned_way():
+    agent, _ = open_agent(None, "StopAt-v1")
+    env, params = st.make("Subterra/StopAt-v1", tunnel="open:cast:train:0")
+    obs = observed(env, params, env.reset(jax.random.key(0), params)[0])
+    drifted = dataclasses.replace(obs, distance=obs.distance + 5.0)
+
+    def way(agent):
+        _, memory = agent.act(None, agent.begin(None, obs, params), drifted, params, None)
+        return 100.0 * float(memory.kept.seen[3])
+
+    assert way(agent) - way(without(agent, "memory")) == pytest.approx(5.0, abs=0.2)

@@ -78,11 +78,13 @@ def test_tensorboard_without_its_library_is_a_clear_error(monkeypatch):
         sinks.check_tensorboard()
 
 
-def runs(folder, coverages):
+def runs(folder, coverages, task="Subterra/Traverse-v1"):
     for k, coverage in enumerate(coverages):
         run = folder / f"seed-{k}"
         run.mkdir()
-        (run / "config.json").write_text('{"task": "Subterra/Traverse-v1"}')
+        (run / "config.json").write_text(json.dumps({"task": task}))
+        log = [{"step": step, "timing": {"seconds": 10.0 + step / 1000}} for step in (100, 20_000)]
+        (run / "log.jsonl").write_text("".join(f"{json.dumps(line)}\n" for line in log))
         rows = [f"{i + 1},{100 * (i + 1)},{c},{c > 0.5:d},7,0" for i, c in enumerate(coverage)]
         (run / "episodes.csv").write_text("\n".join(["episode,step,coverage,success,length,contact", *rows, ""]))
     return sorted(folder.iterdir())
@@ -106,6 +108,21 @@ def test_the_figure_of_several_seeds_is_coverage_and_success_against_episodes_wi
     low, high = np.ptp(band.get_paths()[0].vertices[:, 1]), np.std([20.0, 40.0, 90.0], ddof=1)
     assert low == pytest.approx(2.0 * high)
     np.testing.assert_allclose(success.get_lines()[2].get_ydata(), np.full(140, 100.0))
+
+
+def test_the_figure_of_a_task_with_a_goal_is_success_against_steps_and_seconds_with_lines(tmp_path, monkeypatch):
+    from matplotlib import pyplot
+
+    shown = []
+    monkeypatch.setattr(pyplot, "close", shown.append)
+    curve.write_curve(runs(tmp_path, [[0.9] * 150], "Subterra/StopAt-v1"), tmp_path / "c.png", {"floor": 0.32})
+    steps, seconds = shown[0].axes
+    assert ["steps" in steps.get_xlabel(), "seconds" in seconds.get_xlabel()] == [True, True]
+    for axes, last in ((steps, 0.015), (seconds, 10.0 + 15.0)):
+        lines = {line.get_label(): line for line in axes.get_lines()}
+        assert lines["floor, 32 %"].get_ydata() == pytest.approx([32.0, 32.0])
+        assert lines["seed-0"].get_xdata()[-1] == pytest.approx(last)
+        assert lines["seed-0"].get_ydata()[-1] == 100.0
 
 
 def test_a_run_without_finished_episodes_is_drawn_empty(tmp_path):

@@ -44,7 +44,7 @@ def test_a_run_folder_holds_everything(trained):
         (("--memory", "tape"), "unknown memory 'tape'"),
         (("--auxiliary",), "auxiliary = True is for memory = gru or along, and memory = none does not read it"),
         (("--map",), "map = True is for memory = along, and memory = none does not read it"),
-        (("--frames", "8"), "frames = 8 is for memory = stack, and memory = none does not read it"),
+        (("--frames", "8"), "frames = 8 is for memory = stack or along, and memory = none does not read it"),
         (("--memory", "stack", "--cell", "8"), "cell = 8 is for memory = gru, and memory = stack does not read it"),
         (("--memory", "along", "--map", "--front", "wide"), "map = True is for front = match, and front = wide"),
         (("--legs.robots", "3"), "legs are for embodiment = b2, and embodiment = scout drives on wheels"),
