@@ -161,7 +161,7 @@ class TrainConfig:
 
 # At least half a million transitions per iteration, or the launches of SGD cap the rate.
 _GPU: dict[str, Any] = {
-    "steps": 200_000_000,
+    "steps": 60_000_000,
     "n_envs": 8192,
     "epochs": 2,
     "minibatches": 8,
@@ -170,14 +170,23 @@ _GPU: dict[str, Any] = {
 }
 # An iteration of a GRU costs the same launches however many robots there are.
 _BY_MEMORY: dict[str, dict[str, Any]] = {
-    "gru": {"n_envs": 32_768, "unroll": 32, "minibatches": 8},
-    "along": {"n_envs": 2048, "minibatches": 4, "drives": 512, "drive_steps": 900},
+    "stack": {"steps": 200_000_000},
+    "gru": {"steps": 300_000_000, "n_envs": 32_768, "unroll": 32, "minibatches": 8},
+    "along": {
+        "steps": 8_000_000,
+        "last_rate": 0.05,
+        "n_envs": 2048,
+        "minibatches": 4,
+        "drives": 512,
+        "drive_steps": 900,
+    },
     "map": {"n_envs": 512},
 }
 _COVER = {"stop_coverage": 0.9}
-# With a goal and few robots: who stands in half of the range and is not thrown about stops by chance, and does not
-# learn instead to end the way at a wall.
-_CPU_GOAL: dict[str, Any] = {"steps": 2_500_000, "standing": 1.0, "init_std": 0.3, "last_rate": 0.05}
+_GPU_COVER: dict[str, Any] = {"n_envs": 1024, "epochs": 4, "minibatches": 4, "hidden": (64, 64)}
+# With a goal and few robots: who stands in half of the range and is not thrown against the walls stops by chance, and
+# does not learn instead to end the way at a wall.
+_CPU_GOAL: dict[str, Any] = {"steps": 4_000_000, "standing": 1.0, "init_turn": 0.1, "last_rate": 0.05}
 # Settings that some memories read and others do not.
 _READ_BY: dict[str, tuple[str, ...]] = {
     "frames": ("stack", "along"),
@@ -208,7 +217,10 @@ def make_config(task: str, preset: str = "cpu", memory: str = "none") -> TrainCo
         settings |= {**_GPU, **_BY_MEMORY.get(memory, {})}
     if task in TASKS:
         covers = TASKS[task].rule.errand == "cover"
-        settings |= _COVER if covers else _CPU_GOAL if preset == "cpu" else {}
+        if covers:
+            settings |= _COVER | (_GPU_COVER if preset == "gpu" else {})
+        elif preset == "cpu":
+            settings |= _CPU_GOAL
     return TrainConfig(**settings)
 
 

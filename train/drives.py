@@ -63,7 +63,7 @@ def record_drives(driver: Driver, policy: Policy, params: Any, key: PRNGKeyArray
 
     def look(kept: Any, obs: Any, command: Array) -> Any:
         reckoned, walls = kept
-        reckoned = inputs.see(inputs.obey(reckoned, command), obs)
+        reckoned = inputs.see(inputs.obey(reckoned, command, vehicle.period), obs)
         return reckoned, walls_of.look(walls, obs, command, params)
 
     def read(kept: Any, obs: Any) -> Array:

@@ -79,6 +79,9 @@ class Session:
             The last snapshot; None after Ctrl-C, with the checkpoint saved.
         """
         last = train_sessions([self], [self.folder.begin(resume=resume, overwrite=overwrite)], [label])
+        if devices.leads():
+            write_curve([self.folder.path], self.folder.path / "curve.png")
+            clock.lap("curve")
         return None if last is None else last[0]
 
     def note(self, now: Snapshot, *, save: bool = False) -> None:
@@ -98,12 +101,9 @@ class Session:
         self.log, self._sinks = None, []
 
     def finish(self, snapshot: Snapshot) -> None:
-        """Writes the last checkpoint, unless it has been written, and the curve."""
+        """Writes the last checkpoint, unless it has been written."""
         if not self.folder.has(snapshot.iteration):
             self.folder.save(snapshot)
-        if not devices.leads():
-            return
-        write_curve([self.folder.path], self.folder.path / "curve.png")
 
     def score(self, snapshot: Snapshot, episodes: int) -> dict[str, Any]:
         """Evaluates the policy that was kept, writes `evaluation.json`, and prints the scores."""
@@ -170,6 +170,7 @@ def run_seeds(out: Path, sessions: list[Session], *, resume: bool, overwrite: bo
     )
     last = train_sessions(sessions, snapshots, [f"seed {session.learner.config.seed}" for session in sessions])
     write_curve([session.folder.path for session in sessions], out / "curve.png")
+    clock.lap("curve")
     if last is None:
         return EXIT_INTERRUPTED
     if not episodes:

@@ -29,11 +29,12 @@ class Reckoned:
     flag: Float[Array, ""]  # 1 once the goal's flag has been seen
     distance: Float[Array, ""]  # odometer's distance at the flag, or at the start, m
     heading: Float[Array, ""]  # odometer's heading there, rad
+    obeyed: Float[Array, ""]  # distance commanded since then, m
 
 
 def begin(obs: Observed) -> Reckoned:
     """Returns the reckoning at the first observation of an episode."""
-    return Reckoned(jnp.zeros(2), jnp.zeros(()), jnp.asarray(obs.distance), jnp.asarray(obs.heading))
+    return Reckoned(jnp.zeros(2), jnp.zeros(()), jnp.asarray(obs.distance), jnp.asarray(obs.heading), jnp.zeros(()))
 
 
 def see(before: Reckoned, obs: Observed) -> Reckoned:
@@ -45,12 +46,13 @@ def see(before: Reckoned, obs: Observed) -> Reckoned:
         flag=jnp.maximum(before.flag, jnp.asarray(obs.flag, jnp.float32)),
         distance=anew(obs.distance, before.distance),
         heading=anew(obs.heading, before.heading),
+        obeyed=anew(0.0, before.obeyed),
     )
 
 
-def obey(now: Reckoned, command: Float[Array, "2"]) -> Reckoned:
-    """Returns the reckoning after a command, m/s and rad/s."""
-    return dataclasses.replace(now, command=command)
+def obey(now: Reckoned, command: Float[Array, "2"], period: Float[Array, ""] | float) -> Reckoned:
+    """Returns the reckoning after a command, m/s and rad/s, of one period, s."""
+    return dataclasses.replace(now, command=command, obeyed=now.obeyed + command[0] * period)
 
 
 def way_to_go(now: Reckoned, obs: Observed, params: EnvParams) -> Float[Array, ""]:
@@ -77,7 +79,8 @@ def look(
         obs: The observation.
         way: Distance still to drive, m, reckoned or estimated.
         params: The task.
-        relief: Show the walls' relief too: how far each beam ends beyond the wall beside the robot.
+        relief: Show what a memory can add up: how far each beam ends beyond the wall beside the robot, the phase of
+            the rings, and how far the commands are ahead of the odometer.
     """
     reach = params.lidar.range_max
     ranges, vehicle = obs.ranges, params.vehicle
@@ -90,7 +93,8 @@ def look(
         now.flag * jnp.stack([jnp.ones(()), jnp.sin(turned), jnp.cos(turned)]),
     ]
     if relief:
-        parts += [_relief(ranges), _phase(obs, now)]
+        ahead = now.obeyed - (obs.distance - now.distance)
+        parts += [_relief(ranges), _phase(obs, now), scaled_way(ahead)]
     further = [jnp.ravel(value) for name, value in sorted(obs.entries.items()) if name not in _KNOWN]
     return jnp.concatenate([*parts, *(jnp.arcsinh(value.astype(jnp.float32)) for value in further)])
 

@@ -78,7 +78,7 @@ class Memory:
 
     def take(self, before: Kept, command: Float[Array, "2"], obs: Observed, params: EnvParams, given: "Given") -> Kept:
         """Returns what is kept after a command (m/s and rad/s, as obeyed) and the observation that followed."""
-        reckoned = inputs.see(inputs.obey(before.reckoned, command), obs)
+        reckoned = inputs.see(inputs.obey(before.reckoned, command, params.vehicle.period), obs)
         located = before.located
         if located is not None:
             raised = reckoned.flag > before.reckoned.flag

@@ -34,7 +34,7 @@ def test_a_setting_that_makes_no_sense_is_refused_by_name(name):
 @pytest.mark.parametrize("task", [id for id in st.TASKS])
 def test_every_task_has_presets_that_make_sense(task, preset):
     config = check(make_config(task, preset))
-    assert preset == "cpu" or config.steps_per_iteration >= 100_000
+    assert preset == "cpu" or config.steps_per_iteration >= 50_000
 
 
 def test_an_unknown_memory_or_preset_is_refused_with_those_there_are():

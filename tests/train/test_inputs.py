@@ -94,6 +94,15 @@ def test_a_start_that_is_40_m_off_makes_another_way_to_go(plan):
     assert way_at_start(env, params, flat) - way_at_start(env, params, shifted) == pytest.approx(40.0, abs=1e-3)
 
 
+def test_who_remembers_reads_how_far_the_commands_are_ahead_of_the_odometer(plan):
+    env, params = st.make("Subterra/StopAtShort-v1", tunnel=plan)
+    obs = observed(env, params, env.reset(jax.random.key(0), params)[0])
+    now, moved = inputs.begin(obs), dataclasses.replace(obs, distance=obs.distance + 0.1)
+    for _ in range(3):
+        now = inputs.obey(now, jnp.array([1.0, 0.0]), 0.1)
+    assert float(100.0 * inputs.look(now, moved, 0.0, params, relief=True)[-1]) == pytest.approx(0.2, abs=1e-4)
+
+
 def test_after_the_flag_the_way_leads_back_to_the_start(plan):
     env, params = st.make("Subterra/Return-v1", tunnel=plan)
     flat, _ = env.reset(jax.random.key(0), params)
