@@ -64,19 +64,16 @@ Keep = Callable[[Episode, Taken, EnvParams], Any]
 
 def count_nothing(state: State, params: EnvParams) -> tuple[()]:
     """Start no tally."""
-    del state, params
     return ()
 
 
 def until_the_end(now: Episode, taken: Taken, params: EnvParams) -> tuple[Any, Array]:
     """Leave the tally, and end where the environment ends."""
-    del params
     return now.tally, taken.terminated | taken.truncated
 
 
 def keep_nothing(now: Episode, taken: Taken, params: EnvParams) -> tuple[()]:
     """Keep nothing of a step."""
-    del now, taken, params
     return ()
 
 

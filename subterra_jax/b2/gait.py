@@ -181,17 +181,14 @@ class WalkPolicy:
 
     def initial_memory(self, key: PRNGKeyArray | None = None, n_envs: int | None = None) -> tuple[()]:
         """Return no memory; for `subterra_jax.policies.Policy`."""
-        del key, n_envs
         return ()
 
     def restart(self, memory: tuple[()], done: Bool[Array, "*env"]) -> tuple[()]:
-        del done
         return memory
 
     def __call__(
         self, obs: Float[Array, "*batch n_obs"], memory: tuple[()] = (), state: Any = None
     ) -> tuple[Float[Array, "*batch 12"], tuple[()]]:
-        del state
         return self.act(obs), memory
 
 

@@ -85,11 +85,9 @@ class Legs(Unicycle):
 
     def draw_reset(self, key: Keys, batch: Batch, params: EnvParams) -> WalkResetNoise:
         """Draw how the robot is built, and its first readings."""
-        del params
         return draws.draw_reset(key, batch)
 
     def draw_step(self, key: PRNGKeyArray, batch: Batch, params: EnvParams) -> WalkStepNoise:
-        del params
         return draws.draw_step(key, (*batch, PERIODS))
 
     def begin(self, draw: WalkResetNoise, state: State, params: EnvParams) -> LegsState:
@@ -149,7 +147,6 @@ class LegOdometer(Odometer):
     """Distance by the standing legs and heading by the gyroscope, with the bias of the heading that the task states."""
 
     def advance(self, own: OdometryState, step: Step, noise: Noise, params: EnvParams) -> OdometryState:
-        del noise
         sums = step.after[Legs.name].sums
         turned = sums.turn + own.heading_bias * jnp.asarray(params.vehicle.period)
         return dataclasses.replace(own, distance=own.distance + sums.distance, heading=wrap(own.heading + turned))
@@ -165,13 +162,11 @@ class TrunkLidar(PlanarLidar):
 
     def true_ranges(self, own: Any, sight: Sight, params: EnvParams) -> Array:
         """Cast the beams from the trunk, m."""
-        del own
         walk = sight.parts[Legs.name].walk
         return scan(walk, sight.station, params.walk, params.lidar, params.relief)
 
     def skips_unwanted(self, params: EnvParams) -> bool:
         """Tell that every scan is cast."""
-        del params
         return False
 
 
@@ -188,7 +183,6 @@ class TrunkSpatialLidar(SpatialLidar):
 
     def poses(self, own: Any, sight: Sight, params: EnvParams) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
         """Return origin (m) and direction of each beam, tunnel frame."""
-        del own
         sensor, walk = params.lidar, sight.parts[Legs.name].walk
         quaternion, unit = walk.body.qpos[3:7], jnp.eye(3)
         ahead, left, up = (tuple(rotate(quaternion, unit[i])) for i in range(3))

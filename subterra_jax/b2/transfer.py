@@ -149,20 +149,17 @@ def _walk(now: Episode) -> Walk:
 
 
 def _start(state: State, params: EnvParams) -> tuple[Array, Array, Array]:
-    del state, params
     no = jnp.zeros((), bool)
     return no, no, no
 
 
 def _add(now: Episode, taken: Taken, params: EnvParams) -> tuple[tuple[Array, Array, Array], Array]:
-    del now, params
     flags = (taken.info["success"], taken.info["contact"], taken.info["fall"])
     return flags, taken.terminated | taken.truncated
 
 
 def _keep(now: Episode, taken: Taken, params: EnvParams) -> Float[Array, ""]:
     """Keep the lateral offset, m; NaN once the episode is over."""
-    del params
     return jnp.where(now.over, jnp.nan, taken.after.lateral)
 
 

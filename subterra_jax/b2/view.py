@@ -62,7 +62,6 @@ class RobotView:
         Raises:
             PictureError: There is no OpenGL.
         """
-        del params, obs
         walk = state if isinstance(env, WalkEnv) else state.legs.walk
         qpos = np.array(walk.body.qpos, np.float64)
         qpos[:3] += np.asarray(self._track.position[walk.anchor], np.float64)

@@ -58,7 +58,6 @@ class WalkEnv:
 
     def skips_unwanted(self, params: WalkParams) -> bool:
         """Tell that every observation is made."""
-        del params
         return False
 
     def observation_space(self, params: WalkParams) -> Box:
@@ -158,7 +157,6 @@ class WalkEnv:
         self, state: WalkState, noise: WalkStepNoise | None, params: WalkParams, wanted: Bool[Array, ""] | bool = True
     ) -> Float[Array, "n_obs"]:
         """Return the observation of a state, which holds it already; `noise` and `wanted` change nothing."""
-        del noise, wanted
         own = observation.observe_self(state)
         return jnp.concatenate([own, observation.observe_truth(state, params.track)]) if self.privileged else own
 

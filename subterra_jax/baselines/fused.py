@@ -48,7 +48,6 @@ class FusedCount(Localiser):
     def update(
         self, memory: Belief, obs: Observed, driven: Driven, params: EnvParams, known: Known
     ) -> tuple[Station, Belief]:
-        del known
         step = driven.speed * params.vehicle.period
         belief = _predict(memory, driven.direction * driven.cosine * step)
         # Only the ratio of reading to command is new, and it must not move the mean of the station by itself.

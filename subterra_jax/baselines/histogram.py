@@ -129,7 +129,6 @@ class HistogramLocaliser(Localiser):
     def update(
         self, memory: HistogramMemory, obs: Observed, driven: Driven, params: EnvParams, known: Known
     ) -> tuple[Station, HistogramMemory]:
-        del known
         walls, period = self.walls.pick(params.tunnel), jnp.asarray(params.vehicle.period)
         range_max = jnp.asarray(params.lidar.range_max)
         distance, turn, reckoning = reckon(memory.reckoning, obs, driven.speed, self.odometer_share, period)

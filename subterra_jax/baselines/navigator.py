@@ -178,7 +178,6 @@ class Navigator:
         return self.localiser.privileged
 
     def begin(self, key: PRNGKeyArray, obs: Observed, params: EnvParams) -> Memory:
-        del key
         return Memory(
             steering=self.steering.begin(obs, params),
             localiser=self.localiser.begin(obs, params),
@@ -189,7 +188,6 @@ class Navigator:
     def act(
         self, key: PRNGKeyArray, memory: Memory, obs: Observed, params: EnvParams, known: Known
     ) -> tuple[Action, Memory]:
-        del key
         steering = self.steering.look(memory.steering, obs, memory.command, params)
         now, raised, done = watch(memory.mission, obs, params)
         moved = memory.command[0] * params.vehicle.period

@@ -41,13 +41,11 @@ class Random(Agent):
     name = "random"
 
     def begin(self, key: PRNGKeyArray, obs: Observed, params: EnvParams) -> Float[Array, ""]:
-        del key, obs, params
         return jnp.zeros(())
 
     def act(
         self, key: PRNGKeyArray, memory: Float[Array, ""], obs: Observed, params: EnvParams, known: Known
     ) -> tuple[Action, Float[Array, ""]]:
-        del obs, known
         share = jax.random.uniform(key, (3,))
         speed = params.vehicle.speed_max * share[0]
         yaw_rate = params.vehicle.yaw_rate_max * (2.0 * share[1] - 1.0)

@@ -244,7 +244,6 @@ class ScanMatcher(Localiser):
     def update(
         self, memory: MatchMemory, obs: Observed, driven: Driven, params: EnvParams, known: Known
     ) -> tuple[Station, MatchMemory]:
-        del known
         period = jnp.asarray(params.vehicle.period)
         distance, turn, reckoning = reckon(memory.reckoning, obs, driven.speed, self.odometer_share, period)
         pose = move_pose(memory.pose, distance * (1.0 + memory.scale), turn, memory.pose.bend)

@@ -118,7 +118,6 @@ class OdometerCount(Localiser):
     def update(
         self, memory: Count, obs: Observed, driven: Driven, params: EnvParams, known: Known
     ) -> tuple[Station, Count]:
-        del known
         step = obs.distance - memory.reading
         station = memory.station + driven.direction * driven.cosine * step
         distance, steps = memory.distance + jnp.abs(step), memory.steps + 1.0
@@ -135,13 +134,11 @@ class Truth(Localiser):
     privileged = True
 
     def begin(self, obs: Observed, params: EnvParams) -> Float[Array, ""]:
-        del obs, params
         return jnp.zeros(())
 
     def update(
         self, memory: Float[Array, ""], obs: Observed, driven: Driven, params: EnvParams, known: Known
     ) -> tuple[Station, Float[Array, ""]]:
-        del obs, driven, params
         assert known is not None
         direction = jnp.where(known["heading_cos"] > 0.0, 1.0, -1.0)
         return Station(known["station"], jnp.full((), -5.0), direction), memory

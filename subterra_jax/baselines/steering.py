@@ -135,7 +135,6 @@ class CentreLine(Steering):
         return jnp.cos(memory.angle)
 
     def steer(self, memory: Corridor, speed: Float[Array, ""], params: EnvParams) -> Float[Array, "2"]:
-        del params
         return jnp.stack([speed, -self.offset_gain * memory.offset - self.angle_gain * memory.angle])
 
     def turn_round(self, memory: Corridor) -> Corridor:

@@ -191,7 +191,6 @@ class Faults(Part):
             Random bits `(*batch, 2)`, of which the second word counts; uniform numbers for the severity `(*batch,)` and
             the sizes `(*batch, 7)`; and normal ones for what was read before the start, `(*batch, 5, 2)`.
         """
-        del params
         return (
             jax.random.bits(key[0], (*batch, 2), jnp.uint32),
             jax.random.uniform(key[1], batch, jnp.float32),

@@ -90,7 +90,6 @@ class Imu(Part):
         return {"imu": ImuParams()}
 
     def draw_reset(self, key: Keys, batch: Batch, params: EnvParams) -> Float[Array, "*batch 6"]:
-        del params
         return jax.random.normal(key, (*batch, 6), jnp.float32)
 
     def normals(self, params: EnvParams) -> int:
@@ -127,7 +126,6 @@ class Imu(Part):
 
     def observe(self, own: ImuState, sight: Sight, noise: Noise, params: EnvParams) -> dict[str, Array]:
         """Return `imu`: the samples of the last step, one after another."""
-        del own, noise, params
         return {"imu": sight.parts[self.name].samples.reshape(-1)}
 
     def space(self, params: EnvParams) -> dict[str, Bounds]:
@@ -140,7 +138,6 @@ class Imu(Part):
         Raises:
             ValueError: There is no sample.
         """
-        del others
         if params.imu.samples < 1:
             raise ValueError(f"the imu needs one sample a step or more, got samples={params.imu.samples}")
 

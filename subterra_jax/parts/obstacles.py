@@ -115,11 +115,9 @@ class Obstacles(Part):
 
     def draw_reset(self, key: Keys, batch: Batch, params: EnvParams) -> UInt32[Array, "*batch 2"]:
         """Draw random bits, the first of two words: the second is that of the faults."""
-        del params
         return jax.random.bits(key, (*batch, 2), jnp.uint32)
 
     def begin(self, draw: UInt32[Array, "2"], state: State, params: EnvParams) -> ObstacleState:
-        del params
         return ObstacleState(draw[0], state.station)
 
     def clearance(

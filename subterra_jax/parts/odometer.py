@@ -130,7 +130,6 @@ class Odometer(Part):
         return params.odometry.n_step_noise
 
     def begin(self, draw: Float[Array, "n"], state: State, params: EnvParams) -> OdometryState:
-        del state
         return start_odometry(draw, params.odometry)
 
     def advance(self, own: OdometryState, step: Step, noise: Noise, params: EnvParams) -> OdometryState:
@@ -140,12 +139,10 @@ class Odometer(Part):
         return advance_odometry(own, step.drive.wheels, period, noise.normal, params.odometry, backward)
 
     def observe(self, own: OdometryState, sight: Sight, noise: Noise, params: EnvParams) -> dict[str, Array]:
-        del own, noise, params
         seen = sight.parts[self.name]
         return {"odometry": jnp.stack([seen.distance, seen.heading])}
 
     def space(self, params: EnvParams) -> dict[str, Bounds]:
-        del params
         return {"odometry": (np.array([-np.inf, -np.pi]), np.array([np.inf, np.pi]))}
 
     def privileged(self, own: OdometryState) -> dict[str, Array]:

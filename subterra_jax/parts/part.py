@@ -149,17 +149,14 @@ class Part(abc.ABC):
             batch: Leading axes of every array returned.
             params: The task.
         """
-        del key, batch, params
         return ()
 
     def normals(self, params: EnvParams) -> int:
         """Count the standard normal numbers that one step takes."""
-        del params
         return 0
 
     def uniforms(self, params: EnvParams) -> int:
         """Count the uniform numbers that one step takes."""
-        del params
         return 0
 
     def begin(self, draw: Any, state: State, params: EnvParams) -> Any:
@@ -170,52 +167,42 @@ class Part(abc.ABC):
             state: The robot at its start, with the states of the parts before this one.
             params: The task.
         """
-        del draw, state, params
         return ()
 
     def drive(self, own: Any, drive: Drive, state: State, params: EnvParams) -> Drive:
         """Change the motion between command and ground, as slip does."""
-        del own, state, params
         return drive
 
     def clearance(self, own: Any, position: Array, station: Array, tunnel: Tunnel, params: EnvParams) -> Any:
         """Measure the distance from a point to what the part puts into the tunnel, m; `inf` for nothing."""
-        del own, position, station, tunnel, params
         return np.inf
 
     def advance(self, own: Any, step: Step, noise: Noise, params: EnvParams) -> Any:
         """Return the part's state after a step."""
-        del step, noise, params
         return own
 
     def look_from(self, own: Any, sight: Sight, params: EnvParams) -> Sight:
         """Change the moment that sensors show, as a delay does."""
-        del own, params
         return sight
 
     def hits(self, own: Any, sight: Sight, directions: Float[Array, "n_beams 2"], params: EnvParams) -> Any:
         """Measure how far along each beam the part's obstacles are met, m; `inf` for none."""
-        del own, sight, directions, params
         return np.inf
 
     def spoil(self, own: Any, ranges: Float[Array, n_beams], noise: Noise, params: EnvParams) -> Array:
         """Change true ranges, as dust does."""
-        del own, noise, params
         return ranges
 
     def observe(self, own: Any, sight: Sight, noise: Noise, params: EnvParams) -> dict[str, Array]:
         """Return the part's entries of the observation by name, each `(n,)` or a single number."""
-        del own, sight, noise, params
         return {}
 
     def space(self, params: EnvParams) -> dict[str, Bounds]:
         """Return lowest and highest values of each entry of `observe`, in the same order; numbers may be traced."""
-        del params
         return {}
 
     def images(self, params: EnvParams) -> dict[str, tuple[int, int]]:
         """Return rows and columns of the entries that are images, row by row in the observation."""
-        del params
         return {}
 
     def check(self, others: frozenset[str], params: EnvParams) -> None:
@@ -232,37 +219,30 @@ class Part(abc.ABC):
 
     def privileged(self, own: Any) -> dict[str, Array]:
         """Return what a teacher or a critic may know of the part, and an agent may not."""
-        del own
         return {}
 
     def info(self, own: Any) -> dict[str, Array]:
         """Return the part's entries of `info`."""
-        del own
         return {}
 
     def levels(self, params: EnvParams) -> range:
         """Return the levels of difficulty that an evaluation goes through evenly; empty for a part without."""
-        del params
         return range(0)
 
     def at_level(self, params: EnvParams, level: Any) -> EnvParams:
         """Return the params with one level of difficulty."""
-        del level
         return params
 
     def with_beams(self, own: Any, share: float) -> Any:
         """Return the state for a LiDAR of `share` times as many beams."""
-        del share
         return own
 
     def boxes(self, own: Any, station: Array, tunnel: Tunnel, params: EnvParams) -> list[Boxes]:
         """Return boxes near a station, for pictures."""
-        del own, station, tunnel, params
         return []
 
     def skips_unwanted(self, params: EnvParams) -> bool:
         """Tell whether a batch of observations costs little for those that nobody wants."""
-        del params
         return False
 
     @classmethod
@@ -283,7 +263,6 @@ class Motion(Part):
 
     def draw_step(self, key: PRNGKeyArray, batch: Batch, params: EnvParams) -> Any:
         """Draw what a motion needs beside `normals` and `uniforms`, for a whole batch at once."""
-        del key, batch, params
         return ()
 
     @abc.abstractmethod

@@ -33,7 +33,6 @@ class PlanarLidar(Part):
 
     def true_ranges(self, own: Any, sight: Sight, params: EnvParams) -> Array:
         """Cast the beams against the walls, m."""
-        del own
         return lidar.scan(sight.tunnel, sight.position, sight.heading, sight.station, params.lidar, sight.wanted)
 
     def space(self, params: EnvParams) -> dict[str, Bounds]:

@@ -72,19 +72,15 @@ class Slip(Part):
         return {"slip": SlipParams()}
 
     def draw_reset(self, key: Keys, batch: Batch, params: EnvParams) -> Float[Array, "*batch 3"]:
-        del params
         return jax.random.normal(key, (*batch, 3), jnp.float32)
 
     def normals(self, params: EnvParams) -> int:
-        del params
         return 1
 
     def begin(self, draw: Float[Array, "3"], state: State, params: EnvParams) -> SlipState:
-        del state
         return start_slip(draw, params.slip)
 
     def drive(self, own: SlipState, drive: Drive, state: State, params: EnvParams) -> Drive:
-        del state, params
         wheels = true_motion(drive.wheels, own)
         return Drive(wheels, wheels)
 

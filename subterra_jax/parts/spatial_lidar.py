@@ -211,12 +211,10 @@ class SpatialLidar(Part):
 
     def begin(self, draw: Any, state: State, params: EnvParams) -> Any:
         """Stand still; nothing is kept without a sweep."""
-        del draw
         return Sweeping(state.position, state.heading) if params.lidar.sweep else ()
 
     def advance(self, own: Any, step: Step, noise: Noise, params: EnvParams) -> Any:
         """Keep the pose before the step."""
-        del noise
         return Sweeping(step.before.position, step.before.heading) if params.lidar.sweep else own
 
     def poses(self, own: Any, sight: Sight, params: EnvParams) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
@@ -236,7 +234,6 @@ class SpatialLidar(Part):
         return places, turned
 
     def relief(self, sight: Sight, params: EnvParams) -> Relief:
-        del params
         return sight.tunnel.space.relief
 
     def look(self, own: Any, sight: Sight, uniform: Any, params: EnvParams) -> tuple[Met, Array, Array]:

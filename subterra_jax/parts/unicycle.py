@@ -192,10 +192,8 @@ class Unicycle(Motion):
         return {"vehicle": VehicleParams()}
 
     def obey(self, action: Float[Array, "n_action"], state: State, params: EnvParams) -> Float[Array, "2"]:
-        del state
         return clip_action(action[:2], params.vehicle)
 
     def move(self, state: State, drive: Drive, noise: Any, tunnel: Tunnel, params: EnvParams) -> Moved:
-        del noise, tunnel
         position, heading = follow_arc(state.position, state.heading, drive.motion, jnp.asarray(params.vehicle.period))
         return Moved(position, heading, drive, (), jnp.inf, False, False, {})

@@ -96,7 +96,6 @@ class Learnt(Localised):
         return self.layout.memory.kind == "map"
 
     def begin(self, key: PRNGKeyArray, obs: Observed, params: EnvParams) -> LearntMemory:
-        del key
         kept = self.layout.memory.begin(obs, params, self.given)
         return LearntMemory(kept, start_memory(self.layout.shape, ()), jnp.zeros(2))
 
@@ -104,7 +103,6 @@ class Learnt(Localised):
         self, key: PRNGKeyArray, memory: LearntMemory, obs: Observed, params: EnvParams, known: Known
     ) -> tuple[Action, LearntMemory]:
         """Returns command and estimate of one control period, and the memory after it."""
-        del key, known
         own = self.layout.memory
         kept = own.take(memory.kept, memory.command, obs, params, self.given)
         variables = {"params": nested(part(self.tensors, f"{NETWORK}."))}

@@ -65,7 +65,6 @@ class Trained(Agent):
 
     def with_map(self, params: EnvParams) -> "Trained":
         """Returns the agent with the map of a task; itself if it uses none."""
-        del params
         return self
 
 

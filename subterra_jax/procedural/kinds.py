@@ -123,7 +123,6 @@ class Kind:
         Returns:
             Layers (`subterra_jax.procedural.surfaces.Layer`), which are added to those of the ranges.
         """
-        del rng, length, half_width
         return []
 
 

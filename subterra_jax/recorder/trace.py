@@ -103,7 +103,6 @@ def drive(
 
 def _keep(now: Episode, taken: Taken, params: EnvParams) -> tuple[Any, dict[str, Any]]:
     """Keep one step: its end, and a row of each series."""
-    del now, params
     return (taken.after, taken.noise), {
         "observation": taken.observation,
         "action": taken.action,

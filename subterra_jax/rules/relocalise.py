@@ -48,11 +48,9 @@ class Relocalise(GoalRule):
 
     def space(self, params: EnvParams) -> dict[str, Bounds]:
         """Distance between rings of the lining, m; 0 where there are none."""
-        del params
         return {"ring_pitch": (0.0, np.inf)}
 
     def observe(self, state: State, tunnel: Tunnel) -> dict[str, Array]:
-        del state
         return {"ring_pitch": tunnel.ring_pitch}
 
     def judge(self, step: Step, params: EnvParams) -> Verdict:
@@ -81,7 +79,6 @@ class Relocalise(GoalRule):
 
     def shortest_way(self, state: State, tunnel: Tunnel, params: EnvParams) -> Float[Array, ""]:
         """Return NaN: how far one has to drive depends on what there is to be seen."""
-        del state, tunnel, params
         return jnp.full((), jnp.nan, jnp.float32)
 
     def least_length(self, params: EnvParams) -> float:

@@ -119,12 +119,10 @@ class Rule(abc.ABC):
 
     def draw_reset(self, key: Keys, batch: Batch, params: EnvParams) -> Any:
         """Draw what a start needs, for a whole batch at once; by default two numbers in [-1, 1] for `spread`."""
-        del params
         return jax.random.uniform(key, (*batch, 2), jnp.float32, minval=-1.0)
 
     def start(self, draw: Any, tunnel: Tunnel, params: EnvParams) -> Start:
         """Choose the start of an episode; by default `params.start`, facing growing stations."""
-        del tunnel
         return Start(jnp.asarray(params.start.station, jnp.float32), **spread(draw, params))
 
     def place(self, start: Start, choice: Choice) -> Start:
@@ -139,12 +137,10 @@ class Rule(abc.ABC):
 
     def space(self, params: EnvParams) -> dict[str, Bounds]:
         """Names and bounds of the numbers that the rule adds to the observation."""
-        del params
         return {}
 
     def observe(self, state: State, tunnel: Tunnel) -> dict[str, Array]:
         """Return those numbers, in the order of `space`."""
-        del state, tunnel
         return {}
 
     @abc.abstractmethod
@@ -153,22 +149,18 @@ class Rule(abc.ABC):
 
     def privileged(self, state: State) -> dict[str, Array]:
         """Return what a teacher or a critic may know of the rule's state, and an agent may not."""
-        del state
         return {}
 
     def tolerance(self, params: EnvParams) -> Any:
         """Return the error up to which an estimate of the station counts as right, m."""
-        del params
         return constants.TOLERANCE
 
     def shortest_way(self, state: State, tunnel: Tunnel, params: EnvParams) -> Any:
         """Return the length of the shortest way from the start to success, m; NaN where there is no such thing."""
-        del state, tunnel, params
         return jnp.nan
 
     def least_length(self, params: EnvParams) -> float:
         """Return the length of the shortest tunnel that has room for the task, m."""
-        del params
         return 0.0
 
     @classmethod

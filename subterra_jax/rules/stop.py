@@ -149,11 +149,9 @@ class StopAt(GoalRule):
 
     def space(self, params: EnvParams) -> dict[str, Bounds]:
         """Station of the goal, nominal ring length (0 where there are no rings), and the believed start, m."""
-        del params
         return {"goal": (0.0, np.inf), "ring_pitch": (0.0, np.inf), "start": (0.0, np.inf)}
 
     def observe(self, state: State, tunnel: Tunnel) -> dict[str, Array]:
-        del tunnel
         own = state.goal
         return {"goal": own.station, "ring_pitch": own.pitch, "start": own.told}
 
@@ -170,7 +168,6 @@ class StopAt(GoalRule):
         return Verdict(success, stopped, terms, after, {"goal_error": error, "stopped": stopped})
 
     def shortest_way(self, state: State, tunnel: Tunnel, params: EnvParams) -> Float[Array, ""]:
-        del tunnel, params
         return jnp.abs(state.goal.station - state.station)
 
     def least_length(self, params: EnvParams) -> float:

@@ -71,7 +71,6 @@ class Locator(Localiser):
         self, before: LocatorMemory, obs: Observed, driven: Driven, params: Any, known: Known
     ) -> tuple[Station, LocatorMemory]:
         """Takes in a step: adds the scan to the profiles, and asks the memory at the end of each metre."""
-        del known
         at = before.driven + jnp.clip(driven.speed * params.vehicle.period * driven.cosine, 0.0, _STEP)
         now = dataclasses.replace(before, driven=at, reading=obs.distance, steps=before.steps + 1.0)
         ended = jnp.floor(at).astype(jnp.int32) > before.metres
