@@ -28,37 +28,6 @@ if TYPE_CHECKING:
 
 __version__ = VERSION
 
-__all__ = [
-    "TASKS",
-    "AutoReset",
-    "Env",
-    "EnvParams",
-    "LogUniform",
-    "State",
-    "SubterraError",
-    "Tunnel",
-    "TunnelEnv",
-    "TunnelError",
-    "TunnelPlan",
-    "batch",
-    "cache_programs",
-    "constants_digest",
-    "list_tasks",
-    "load_policy",
-    "load_tunnel",
-    "localisability",
-    "make",
-    "parts",
-    "procedural",
-    "randomize",
-    "register",
-    "rollout",
-    "rules",
-    "stack",
-    "tasks",
-    "tunnel",
-]
-
 # Name: module that holds it. The imports above say the same to type checkers.
 _HOMES = {
     "TASKS": "tasks",
@@ -83,6 +52,7 @@ _HOMES = {
     "stack": "tunnel.tunnel",
 }
 _MODULES = ("batch", "parts", "procedural", "rules", "tasks", "tunnel")
+__all__ = ["SubterraError", "TunnelError", *_HOMES, *_MODULES]
 
 
 def __getattr__(name: str) -> Any:

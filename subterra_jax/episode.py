@@ -13,7 +13,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
@@ -62,31 +61,16 @@ Add = Callable[[Episode, Taken, EnvParams], tuple[Any, Array]]
 Keep = Callable[[Episode, Taken, EnvParams], Any]
 
 
-def count_nothing(state: State, params: EnvParams) -> tuple[()]:
-    """Start no tally."""
-    return ()
-
-
-def until_the_end(now: Episode, taken: Taken, params: EnvParams) -> tuple[Any, Array]:
-    """Leave the tally, and end where the environment ends."""
-    return now.tally, taken.terminated | taken.truncated
-
-
-def keep_nothing(now: Episode, taken: Taken, params: EnvParams) -> tuple[()]:
-    """Keep nothing of a step."""
-    return ()
-
-
 @dataclasses.dataclass(frozen=True)
 class Driver:
     """Drives an agent through episodes of one task. Static: jit knows its functions, which must be module-level."""
 
     env: TunnelEnv  # the environment; its action holds the estimate where the caller wants it scored
     # makes the tally of an episode, from the first state and the params of its tunnel and level
-    start: Start = count_nothing
+    start: Start = lambda state, params: ()
     # from an episode, a step taken and those params to the tally and to whether the episode is over
-    add: Add = until_the_end
-    keep: Keep = keep_nothing  # from the same to what is kept of the step
+    add: Add = lambda now, taken, params: (now.tally, taken.terminated | taken.truncated)
+    keep: Keep = lambda now, taken, params: ()  # from the same to what is kept of the step
 
     @in_32_bits()
     def begin(self, params: EnvParams, agent: Agent, seed: Any, tunnel: Any = 0, level: Any = None) -> Episode:
@@ -230,8 +214,3 @@ def _step_one(driver: Driver, agent: Agent, params: EnvParams, now: Episode, t: 
 
 def _unless(over: Bool[Array, ""], old: Array, new: Array) -> Array:
     return jnp.where(over, old, new)
-
-
-def concatenate(rows: list[Any]) -> Any:
-    """Join what was kept of several chunks, on the host."""
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *rows)

@@ -35,13 +35,6 @@ class EnvRow:
         """Return a picture, `(480, 480, 3)` uint8; `None` without `rgb_array`."""
         return None if self.render_mode is None else self._envs.picture(self._index)
 
-    def has_wrapper_attr(self, name: str) -> bool:
-        return hasattr(self, name)
-
-    def get_wrapper_attr(self, name: str) -> Any:
-        """Return an attribute by its name."""
-        return getattr(self, name)
-
 
 class SubterraVecEnv(VecEnv):
     """A batch of environments that reset themselves, each with a fresh draw.

@@ -15,11 +15,10 @@ from subterra_jax.baselines.histogram import HistogramLocaliser
 from subterra_jax.episode import in_tunnel
 from subterra_jax.policies.files import Conditions, PolicyError
 from subterra_jax.policies.layout import Layout
-from subterra_jax.policies.localised import Localised, part
 from subterra_jax.policies.locate.map_strip import MapStrip
 from subterra_jax.policies.memories import Kept
 from subterra_jax.policies.network import Network, init, start_memory, to_action
-from subterra_jax.policies.trained import Tensors, nested
+from subterra_jax.policies.trained import Tensors, Trained, nested, part
 from subterra_jax.state import EnvParams
 from subterra_jax.tunnel_env import TunnelEnv
 
@@ -37,7 +36,7 @@ class LearntMemory:
 
 
 @struct.dataclass
-class Learnt(Localised):
+class Learnt(Trained):
     """Drives by a trained network."""
 
     kind: ClassVar[str] = KIND
@@ -86,7 +85,7 @@ class Learnt(Localised):
         return self._filters or super().uses_map
 
     def with_map(self, params: EnvParams) -> "Learnt":
-        """As `Localised.with_map`; a filter on the map is made for every task that it can do."""
+        """As `Trained.with_map`; a filter on the map is made for every task that it can do."""
         if not self._filters:
             return super().with_map(params)
         return dataclasses.replace(self, map=HistogramLocaliser.of(params, cell=self.layout.memory.cell))

@@ -1,15 +1,19 @@
-"""The contract of a trained network as an agent: how a policy file becomes one, and which tasks it can do."""
+"""A trained network as an agent: how a policy file becomes one, which tasks it can do, and the map that it may take."""
 
 import abc
+import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import jax
 from jaxtyping import Array, Float
 
 from subterra_jax.baselines.agent import Agent
 from subterra_jax.policies.files import Conditions
+from subterra_jax.policies.locate import memory
+from subterra_jax.policies.locate.map_strip import map_strip
+from subterra_jax.policies.memories import Given
 from subterra_jax.state import EnvParams
 from subterra_jax.tunnel_env import TunnelEnv
 
@@ -17,14 +21,22 @@ Tensors = dict[str, Float[Array, "..."]]
 
 
 class Trained(Agent):
-    """A trained agent. One class a kind of network, a `flax.struct.dataclass`; `loading.KINDS` lists them."""
+    """A trained agent, whose tensors may hold a learnt localiser.
+
+    One class a kind of network, a `flax.struct.dataclass`; `loading.KINDS` lists them.
+    """
 
     kind: ClassVar[str]  # name of the kind in a policy's facts
+    prefix: ClassVar[str]  # beginning of the names of the localiser's tensors
     learns_errand: ClassVar[bool] = True  # it has learnt one errand, and drives no task with another
+    uses_lidar = True
     tensors: Any  # weights by name, as a policy's file holds them
     low: Any  # smallest action, m/s and rad/s
     high: Any  # largest action, m/s and rad/s
     conditions: Conditions | None  # conditions of its training; None: any
+    map: Any  # the map; None has none
+    hides_map: bool  # take no map: `with_map` changes nothing
+    blind: bool  # cut what the walls tell the localiser: an ablation
 
     @classmethod
     @abc.abstractmethod
@@ -42,7 +54,7 @@ class Trained(Agent):
 
     @abc.abstractmethod
     def try_out(self) -> None:
-        """Lets it act on shapes alone, so that a missing or misshapen tensor is found before it drives.
+        """Compares names and shapes of the tensors with the network's, before it drives.
 
         Raises:
             KeyError: A tensor is missing.
@@ -52,20 +64,58 @@ class Trained(Agent):
 
     @abc.abstractmethod
     def check_task(self, env: TunnelEnv, params: EnvParams, source: str | Path) -> None:
-        """Refuses a task whose errand or observation it does not know.
-
-        Args:
-            env: The environment.
-            params: The task.
-            source: Origin of the policy, with which the message begins.
+        """Refuses a task whose errand or observation it does not know; the message begins with `source`.
 
         Raises:
             PolicyError: It cannot do this task.
         """
 
-    def with_map(self, params: EnvParams) -> "Trained":
-        """Returns the agent with the map of a task; itself if it uses none."""
-        return self
+    @property
+    def uses_map(self) -> bool:
+        return self.map is not None
+
+    @property
+    def takes_map(self) -> bool:
+        return any(name.startswith(f"{self.prefix}{memory.MAP}.") for name in self.tensors)
+
+    @property
+    def given(self) -> Given:
+        own = part(self.tensors, self.prefix)
+        return Given(nested(own) if own else None, self.map, self.blind)
+
+    def localiser_shapes(self) -> Any:
+        front = memory.front_of(part(self.tensors, self.prefix))
+        return jax.eval_shape(lambda key: memory.init(front, key, self.takes_map), jax.random.key(0))
+
+    def check_tensors(self, wanted: Any) -> None:
+        """Compares names and shapes of the tensors with those wanted; errors as `try_out`."""
+        shapes = flat(wanted)
+        for name, leaf in shapes.items():
+            if self.tensors[name].shape != leaf.shape:
+                raise ValueError(f"{name} is {self.tensors[name].shape}, not {leaf.shape}")
+        if further := sorted(set(self.tensors) - set(shapes)):
+            raise ValueError(f"{further[0]} is of no such network")
+
+    def with_map(self, params: EnvParams) -> Self:
+        """Returns the agent with the map of a task if it takes one; runs on the host. A way back is driven without."""
+        if not self.takes_map or self.hides_map or self.blind or params.errand != "stop":
+            return self
+        return self._with(map=map_strip(params.tunnel))
+
+    def without_map(self) -> Self:
+        return self._with(map=None, hides_map=True, name=f"{self.name}, no map")
+
+    def without_walls(self) -> Self:
+        """Returns the agent with the same weights, and nothing that the walls tell its localiser."""
+        return self._with(map=None, blind=True, name=f"{self.name}, cut")
+
+    def _with(self, **changes: Any) -> Self:
+        return dataclasses.replace(self, **changes)  # type: ignore[type-var]  # each subclass is a dataclass
+
+
+def part(tensors: Mapping[str, Any], prefix: str) -> dict[str, Any]:
+    """Returns the tensors whose names begin with `prefix`, without it."""
+    return {name.removeprefix(prefix): leaf for name, leaf in tensors.items() if name.startswith(prefix)}
 
 
 def nested(tensors: Mapping[str, Any]) -> dict[str, Any]:
@@ -74,8 +124,8 @@ def nested(tensors: Mapping[str, Any]) -> dict[str, Any]:
     for name, tensor in tensors.items():
         *path, last = name.split(".")
         branch = tree
-        for part in path:
-            branch = branch.setdefault(part, {})
+        for step in path:
+            branch = branch.setdefault(step, {})
         branch[last] = tensor
     return tree
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from subterra_jax.procedural.geometry import Alignment, wall
-from subterra_jax.tunnel.plan import Lining, TunnelPlan
+from subterra_jax.procedural.geometry import Alignment
+from subterra_jax.tunnel.plan import Lining, TunnelPlan, Wall
 
 NAME = "control"
 LININGS = ("smooth",)
@@ -18,7 +18,7 @@ def control() -> TunnelPlan:
     alignment = Alignment(np.array([0.0, _LENGTH]), np.full(2, 1.0 / _RADIUS), _LENGTH, _STEP)
     station = alignment.station
     at = np.linspace(0.0, _LENGTH, round(_LENGTH / _STEP) + 1)
-    left, right = (wall(alignment, side, at, np.full(len(at), _HALF_WIDTH)) for side in (1.0, -1.0))
+    left, right = (Wall(alignment.offset(at, np.full(len(at), y)), at) for y in (_HALF_WIDTH, -_HALF_WIDTH))
     return TunnelPlan(
         name=NAME,
         provenance="simulated",

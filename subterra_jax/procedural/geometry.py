@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Float
 
 from subterra_jax.host.errors import SubterraError
-from subterra_jax.tunnel.plan import Wall
 
 Range = tuple[float, float]
 
@@ -154,10 +153,3 @@ def wander(
     kernel = np.exp(-2.0 * (np.arange(-reach, reach + 1) / _FINE) ** 2)
     noise = np.convolve(rng.standard_normal(len(at) + 2 * reach), kernel / np.linalg.norm(kernel), mode="valid")
     return sd * np.interp(station, at, noise)
-
-
-def wall(
-    alignment: Alignment, side: float, station: Float[np.ndarray, " n"], distance: Float[np.ndarray, " n"]
-) -> Wall:
-    """Return a wall `distance` metres to the left (`side` 1) or right (−1) of the centreline."""
-    return Wall(vertex=alignment.offset(station, side * distance), station=station)

@@ -77,9 +77,5 @@ class Relocalise(GoalRule):
         info = {"goal_error": error, "stopped": stopped, "direction_right": direction_right}
         return Verdict(success, stopped | overdue, terms, after, info)
 
-    def shortest_way(self, state: State, tunnel: Tunnel, params: EnvParams) -> Float[Array, ""]:
-        """Return NaN: how far one has to drive depends on what there is to be seen."""
-        return jnp.full((), jnp.nan, jnp.float32)
-
     def least_length(self, params: EnvParams) -> float:
         return float(1.0 + 2.0 * np.max(params.goal.margin))

@@ -16,9 +16,8 @@ from subterra_jax.baselines.avoidance import steering_of
 from subterra_jax.baselines.navigator import Memory, Navigator, Pace
 from subterra_jax.baselines.steering import CentreLine
 from subterra_jax.policies.files import Conditions, PolicyError
-from subterra_jax.policies.localised import Localised
 from subterra_jax.policies.locate.map_strip import MapStrip
-from subterra_jax.policies.trained import Tensors
+from subterra_jax.policies.trained import Tensors, Trained
 from subterra_jax.state import EnvParams
 from subterra_jax.tunnel_env import TunnelEnv
 
@@ -27,7 +26,7 @@ ERRANDS = ("stop", "return")
 
 
 @struct.dataclass
-class Locating(Localised):
+class Locating(Trained):
     """Drives to a goal by a learnt localiser."""
 
     kind: ClassVar[str] = KIND
