@@ -41,6 +41,7 @@ class Learnt(Trained):
 
     kind: ClassVar[str] = KIND
     prefix: ClassVar[str] = f"{LOCALISER}."
+    uses_lidar = True
     tensors: Tensors  # weights by name, parts of the name between dots: `network.…`, and with a localiser `localiser.…`
     low: Float[Array, "n_action"]  # smallest action, m/s and rad/s
     high: Float[Array, "n_action"]  # largest action, m/s and rad/s

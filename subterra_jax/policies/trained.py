@@ -27,16 +27,15 @@ class Trained(Agent):
     """
 
     kind: ClassVar[str]  # name of the kind in a policy's facts
-    prefix: ClassVar[str]  # beginning of the names of the localiser's tensors
+    prefix: ClassVar[str] = "localiser."  # beginning of the names of the localiser's tensors, if any
     learns_errand: ClassVar[bool] = True  # it has learnt one errand, and drives no task with another
-    uses_lidar = True
     tensors: Any  # weights by name, as a policy's file holds them
     low: Any  # smallest action, m/s and rad/s
     high: Any  # largest action, m/s and rad/s
     conditions: Conditions | None  # conditions of its training; None: any
-    map: Any  # the map; None has none
-    hides_map: bool  # take no map: `with_map` changes nothing
-    blind: bool  # cut what the walls tell the localiser: an ablation
+    map: Any = None  # the map; None has none
+    hides_map: bool = False  # take no map: `with_map` changes nothing
+    blind: bool = False  # cut what the walls tell the localiser: an ablation
 
     @classmethod
     @abc.abstractmethod

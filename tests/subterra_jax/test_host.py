@@ -97,7 +97,7 @@ def test_the_help_of_this_room_fits_a_screen_and_has_an_example(capsys, monkeypa
     monkeypatch.setenv("COLUMNS", "100")
     monkeypatch.setattr(sys, "argv", ["build"])  # the usage begins with it, and pytest's own path fills a line
     with pytest.raises(SystemExit):
-        parse(lambda words: tyro.cli(command, args=words), ["--help"])
+        parse(lambda words: tyro.cli(command, args=words, prog="python -m scene.build"), ["--help"])
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) <= 40
     assert max(map(len, lines)) <= 100

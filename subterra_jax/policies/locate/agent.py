@@ -31,6 +31,7 @@ class Locating(Trained):
 
     kind: ClassVar[str] = KIND
     prefix: ClassVar[str] = ""
+    uses_lidar = True
     learns_errand: ClassVar[bool] = False
     tensors: Tensors  # weights by name, parts of the name between dots
     low: Float[Array, "2"]  # smallest action, m/s and rad/s
