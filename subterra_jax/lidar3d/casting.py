@@ -17,7 +17,7 @@ from subterra_jax.compiled import in_32_bits
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.lidar3d.finding import find, find_facing, find_facing_from
 from subterra_jax.lidar3d.meeting import Hits, Point
-from subterra_jax.lidar3d.relief import Relief
+from subterra_jax.lidar3d.relief import Relief, block_contents
 
 
 @in_32_bits()
@@ -210,14 +210,13 @@ def require_free(relief: Relief, position: Any, station: float) -> None:
     """
     place = np.asarray(position, np.float64)
     first, n = int(relief.first_block), int(relief.n_blocks)
-    row = np.asarray(relief.frame[first : first + n], np.float64)
-    nearest = np.argsort(np.linalg.norm(row[:, :3] - place, axis=1), kind="stable")[0]
-    at = row[nearest, :3] + row[nearest, 3:6] * np.linspace(-2.0, 2.0, 9)[:, None]
-    way = place - at
-    size = np.linalg.norm(way, axis=1)
-    origins, directions = jnp.asarray(at, jnp.float32), jnp.asarray(way / np.maximum(size, 1e-9)[:, None], jnp.float32)
-    free = _free_lengths(relief, origins, directions, jnp.float32(station), jnp.asarray(size, jnp.float32))
-    if not np.any(np.asarray(free) >= size - 1e-4):
+    rows = np.asarray(relief.frame[first : first + n], np.float64)
+    nearest = int(np.argmin(np.linalg.norm(rows[:, :3] - place, axis=1)))
+    sensor = rows[nearest, 3:12].reshape(3, 3) @ (place - rows[nearest, :3])
+    on_axis = np.linspace(-2.0, 2.0, 9)[:, None] * [1.0, 0.0, 0.0]
+    surface, boxes = block_contents(relief, first + nearest)
+    hidden = _crosses_triangles(on_axis, sensor, surface) | _crosses_boxes(on_axis, sensor, boxes)
+    if hidden.all():
         x, y, z = place
         raise SubterraError(
             f"the sensor at ({x:.2f}, {y:.2f}, {z:.2f}) m, station {station:.1f} m, is inside the wall, or in a thing: "
@@ -225,11 +224,34 @@ def require_free(relief: Relief, position: Any, station: float) -> None:
         )
 
 
-@jax.jit
-def _free_lengths(relief: Relief, origins: Array, directions: Array, station: Array, size: Array) -> Array:
-    """Return how far rays from near a station go, m, at most `size`."""
-    blocks = jax.vmap(block_at, (None, 0, None))(relief, origins, station)
-    return _ranges(relief.shared, origins, directions, blocks, size)
+def _crosses_triangles(
+    start: Float[np.ndarray, "n 3"], end: Float[np.ndarray, "3"], corner: Float[np.ndarray, "t 3 3"]
+) -> Bool[np.ndarray, "n"]:
+    """Tell which lines between some points and another one cross a triangle; all in one frame, m."""
+    edges = np.roll(corner, -1, axis=1) - corner
+    normal = np.cross(edges[:, 0], edges[:, 1])
+    above_end = np.sum((end - corner[:, 0]) * normal, axis=1)
+    crosses = np.zeros(len(start), bool)
+    for k, point in enumerate(start):
+        above = np.sum((point - corner[:, 0]) * normal, axis=1)
+        cut = np.flatnonzero((above > 0.0) != (above_end > 0.0))
+        share = above[cut] / (above[cut] - above_end[cut])
+        met = point + share[:, None] * (end - point)
+        side = np.sum(np.cross(edges[cut], met[:, None] - corner[cut]) * normal[cut, None], axis=-1)
+        crosses[k] = (side >= 0.0).all(axis=1).any()
+    return crosses
+
+
+def _crosses_boxes(
+    start: Float[np.ndarray, "n 3"], end: Float[np.ndarray, "3"], box: Float[np.ndarray, "k 3 4"]
+) -> Bool[np.ndarray, "n"]:
+    """Tell which lines between some points and another one cross a box; boxes as in `Cells.box`."""
+    first, last = (np.einsum("kij,...j->...ki", box[..., :3], point) - box[..., 3] for point in (start, end))
+    step = last - first
+    step = np.where(np.abs(step) < 1e-12, 1e-12, step)
+    faces = np.stack([(-1.0 - first) / step, (1.0 - first) / step])
+    enters, leaves = faces.min(axis=0).max(axis=-1), faces.max(axis=0).min(axis=-1)
+    return ((enters <= leaves) & (enters <= 1.0) & (leaves >= 0.0)).any(axis=1)
 
 
 @in_32_bits()

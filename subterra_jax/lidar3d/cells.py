@@ -219,15 +219,23 @@ def _parts_of_blocks(axis: Axis, parts: Float[np.ndarray, "k n 3"], blocks: Bloc
         return [np.zeros(0, np.int64) for _ in blocks.centre]
     from scipy.spatial import cKDTree  # half a second to import, and planar tasks do not need it
 
-    near = axis.station[cKDTree(axis.position).query(parts.mean(axis=1))[1]]
-    reach = np.linalg.norm(np.ptp(parts, axis=1), axis=1) + 2.0 * (axis.station[1] - axis.station[0])
-    low, high = near - reach, near + reach
+    # In rows of one coordinate each: NumPy reduces a short last axis many times slower.
+    rows = np.ascontiguousarray(parts.transpose(1, 2, 0))
+    low, high = rows.min(axis=0), rows.max(axis=0)
+    near = axis.station[cKDTree(axis.position).query(((low + high) / 2).T)[1]]
+    reach = np.sqrt(np.sum((high - low) ** 2, axis=0)) + 2.0 * (axis.station[1] - axis.station[0])
+    order = np.argsort(near)
+    sorted_near, widest = near[order], reach.max()
     chosen = []
-    for k in range(len(blocks.centre)):
-        close = np.flatnonzero((high >= blocks.ends[k, 0]) & (low <= blocks.ends[k, 1]))
-        corner = (parts[close] - blocks.centre[k]) @ blocks.turn[k].T
-        within = (corner @ blocks.front[k, :3] - blocks.front[k, 3]).min(axis=1) <= MARGIN
-        within &= (corner @ blocks.back[k, :3] - blocks.back[k, 3]).max(axis=1) >= -MARGIN
+    for turn, centre, back, front, ends in zip(
+        blocks.turn, blocks.centre, blocks.back, blocks.front, blocks.ends, strict=True
+    ):
+        close = np.sort(order[slice(*np.searchsorted(sorted_near, [ends[0] - widest, ends[1] + widest]))])
+        close = close[(near[close] + reach[close] >= ends[0]) & (near[close] - reach[close] <= ends[1])]
+        from_centre, within = rows[:, :, close] - centre[:, None], np.ones(len(close), bool)
+        for plane, sign in ((front, 1.0), (back, -1.0)):
+            beyond = sign * ((plane[:3] @ turn) @ from_centre - plane[3])
+            within &= beyond.min(axis=0) <= MARGIN
         chosen.append(close[within])
     return chosen
 
@@ -236,8 +244,11 @@ def _compact(
     surface: Triangles, chosen: np.ndarray, blocks: Blocks, k: int
 ) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
     """Return the chosen triangles in a block's frame, with only the vertices that they use."""
-    used, faces = np.unique(surface.faces[chosen], return_inverse=True)
-    return (surface.vertices[used] - blocks.centre[k]) @ blocks.turn[k].T, faces.reshape(-1, 3)
+    faces = surface.faces[chosen]
+    seen = np.zeros(len(surface.vertices), bool)
+    seen[faces] = True
+    used = np.flatnonzero(seen)
+    return (surface.vertices[used] - blocks.centre[k]) @ blocks.turn[k].T, (np.cumsum(seen) - 1)[faces]
 
 
 def _pack_points(points: Float[np.ndarray, "v 3"], unit: Float[np.ndarray, 2]) -> Int[np.ndarray, "v 3"]:
@@ -274,9 +285,8 @@ def wedge_edge(number: np.ndarray) -> Float[np.ndarray, "k 2"]:
     return np.stack([y, np.choose(turn, [share, 1.0 - share, -share, share - 1.0])], axis=-1)
 
 
-def wedge_place(points: Float[np.ndarray, "*k 2"]) -> Float[np.ndarray, "*k"]:
+def wedge_place(y: Float[np.ndarray, "*k"], z: Float[np.ndarray, "*k"]) -> Float[np.ndarray, "*k"]:
     """Return the directions of points left and up as numbers of wedges, with fractions."""
-    y, z = points[..., 0], points[..., 1]
     turn = np.where(z >= 0.0, np.where(y > 0.0, 0, 1), np.where(y < 0.0, 2, 3))
     share = np.where(turn % 2 == 0, np.abs(z), np.abs(y)) / np.maximum(np.abs(y) + np.abs(z), 1e-30)
     return (turn + share) * (N_WEDGES // 4)
@@ -312,18 +322,18 @@ def _list(
 
 def _wedges(corner: Float[np.ndarray, "t 3 2"]) -> tuple[Int[np.ndarray, p], Int[np.ndarray, p]]:
     """Pair triangles with the wedges that they may reach into, seen along the axis."""
-    edge = np.roll(corner, -1, axis=1) - corner
-    size = np.sum(edge**2, axis=-1)
-    share = np.clip(-np.sum(corner * edge, axis=-1) / np.where(size > 0.0, size, 1.0), 0.0, 1.0)
-    apart = np.sqrt(np.sum((corner + share[..., None] * edge) ** 2, axis=-1)).min(axis=1)
-    turn = wedge_place(corner)
-    swing = np.mod(np.roll(turn, -1, axis=1) - turn + 0.5 * N_WEDGES, N_WEDGES) - 0.5 * N_WEDGES
+    y, z = np.ascontiguousarray(corner.transpose(2, 1, 0))
+    (edge_y, edge_z), turn = (np.roll(along, -1, axis=0) - along for along in (y, z)), wedge_place(y, z)
+    size = edge_y**2 + edge_z**2
+    share = np.clip(-(y * edge_y + z * edge_z) / np.where(size > 0.0, size, 1.0), 0.0, 1.0)
+    apart = np.sqrt(np.min((y + share * edge_y) ** 2 + (z + share * edge_z) ** 2, axis=0))
+    swing = np.mod(np.roll(turn, -1, axis=0) - turn + 0.5 * N_WEDGES, N_WEDGES) - 0.5 * N_WEDGES
     # Around the axis, or too near it to tell.
-    whole = (np.abs(swing.sum(axis=1)) > 1.0) | (apart < 20.0 * MARGIN)
-    from_first = np.stack([np.zeros(len(turn)), swing[:, 0], swing[:, 0] + swing[:, 1]], axis=1)
+    whole = (np.abs(swing.sum(axis=0)) > 1.0) | (apart < 20.0 * MARGIN)
+    from_first = np.stack([np.zeros_like(apart), swing[0], swing[0] + swing[1]])
     loose = 0.5 * N_WEDGES * MARGIN / np.maximum(apart, MARGIN)
-    start = np.floor(turn[:, 0] + from_first.min(axis=1) - loose).astype(np.int64)
-    stop = np.floor(turn[:, 0] + from_first.max(axis=1) + loose).astype(np.int64)
+    start = np.floor(turn[0] + from_first.min(axis=0) - loose).astype(np.int64)
+    stop = np.floor(turn[0] + from_first.max(axis=0) + loose).astype(np.int64)
     start, span = np.where(whole, 0, start), np.where(whole, N_WEDGES, np.minimum(stop - start + 1, N_WEDGES))
     triangle = np.repeat(np.arange(len(corner)), span)
     wedge = np.repeat(start - np.cumsum(span) + span, span) + np.arange(span.sum())
@@ -334,23 +344,24 @@ def _clip(
     corner: Float[np.ndarray, "p 3 3"], wedge: Int[np.ndarray, p]
 ) -> tuple[Float[np.ndarray, "9 p"], Float[np.ndarray, "9 p"], Bool[np.ndarray, "9 p"]]:
     """Return the corners of triangles cut to wedges: place along the axis and depth, m, and which of nine there are."""
-    begin, end = wedge_edge(wedge), wedge_edge(wedge + 1)
-    sides = []
-    for facing, sign in ((begin, 1.0), (end, -1.0)):
-        normal = sign * np.stack([-facing[:, 1], facing[:, 0]], axis=-1) / np.linalg.norm(facing, axis=1)[:, None]
-        sides.append(np.einsum("pki,pi->pk", corner[..., 1:], normal) + MARGIN)
+    begin, end = wedge_edge(wedge).T, wedge_edge(wedge + 1).T
+    corner = np.ascontiguousarray(corner.transpose(2, 1, 0))  # of columns, as above
+    _, y, z = corner
+    sides = [
+        sign * (z * facing[0] - y * facing[1]) / np.hypot(*facing) + MARGIN
+        for facing, sign in ((begin, 1.0), (end, -1.0))
+    ]
     following = np.roll(corner, -1, axis=1)
     points, inside = [corner], [(sides[0] >= 0.0) & (sides[1] >= 0.0)]
     for side, other in (sides, sides[::-1]):
-        after, other_after = np.roll(side, -1, axis=1), np.roll(other, -1, axis=1)
+        after, other_after = np.roll(side, -1, axis=0), np.roll(other, -1, axis=0)
         crosses = (side >= 0.0) != (after >= 0.0)
         share = np.where(crosses, side / np.where(crosses, side - after, 1.0), 0.0)
-        points.append(corner + share[..., None] * (following - corner))
+        points.append(corner + share * (following - corner))
         inside.append(crosses & (other + share * (other_after - other) >= -1e-12))
-    # NumPy reduces the first of two axes many times faster than a short last one.
-    x, y, z = (np.concatenate([part[..., i].T for part in points]) for i in range(3))
-    middle = (begin + end).T
-    return x, y * middle[0] + z * middle[1], np.concatenate([part.T for part in inside])
+    x, y, z = np.concatenate(points, axis=1)
+    middle = begin + end
+    return x, y * middle[0] + z * middle[1], np.concatenate(inside)
 
 
 def _empty_prism(corner: Float[np.ndarray, "t 3 2"]) -> Float[np.ndarray, n_faces]:

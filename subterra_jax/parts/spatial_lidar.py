@@ -317,8 +317,15 @@ class SpatialLidar(Part):
             raise ValueError("mount, echo and range_max of a sensor must be finite")
         if any(np.ndim(number) for number in numbers):
             return
-        tunnel = params.tunnel.pick(0)
-        station = jnp.asarray(0.5 * tunnel.length)
-        x, y, tangent_x, tangent_y, _ = at_station(tunnel, station)
-        place, _ = stand(tunnel, jnp.stack([x, y]), jnp.arctan2(tangent_y, tangent_x), station, sensor.mount)
-        require_free(tunnel.space.relief, np.asarray(place), float(station))
+        relief, station, place = _half_way(params.tunnel, sensor.mount)
+        require_free(relief, np.asarray(place), float(station))
+
+
+@jax.jit
+def _half_way(tunnel: Any, mount: Mount) -> tuple[Relief, Float[Array, ""], Float[Array, "3"]]:
+    """Return the surface of the first tunnel, the station half way through it, m, and where a sensor is there, m."""
+    tunnel = tunnel.pick(0)
+    station = 0.5 * tunnel.length
+    x, y, tangent_x, tangent_y, _ = at_station(tunnel, station)
+    place, _ = stand(tunnel, jnp.stack([x, y]), jnp.arctan2(tangent_y, tangent_x), station, mount)
+    return tunnel.space.relief, station, place

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -136,13 +137,13 @@ def _draw_length(line: np.random.Generator) -> float:
     return float(np.exp(line.uniform(*np.log(LENGTH))))
 
 
-def shortest(split: str, among: int = 100) -> list[str]:
-    """Return the shortest of the first tunnels of each kind of a split, by name."""
+def shortest(split: str, kinds: Sequence[str] = (), among: int = 100) -> list[str]:
+    """Return the shortest of the first tunnels of some kinds of a split, by name; of each kind if none is given."""
 
     def shortest_of(kind: str) -> int:
         return min(range(among), key=lambda index: _draw_length(_generators(kind, split, index)["line"]))
 
-    return [f"open:{kind}:{split}:{shortest_of(kind)}" for kind in kinds_of(split)]
+    return [f"open:{kind}:{split}:{shortest_of(kind)}" for kind in kinds or kinds_of(split)]
 
 
 def plan(

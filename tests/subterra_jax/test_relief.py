@@ -37,7 +37,7 @@ def test_every_point_of_every_triangle_lies_in_a_cell_that_lists_a_triangle_thro
         local = (points - centre) @ turn.T
         inside = (local @ blocks.front[k, :3] <= blocks.front[k, 3]) & (local @ blocks.back[k, :3] >= blocks.back[k, 3])
         x = np.clip((local[:, 0] - found.low[k]) / found.pitch, 0, n_x - 1).astype(int)
-        wedge = cells.wedge_place(local[:, 1:]).astype(int)
+        wedge = cells.wedge_place(local[:, 1], local[:, 2]).astype(int)
         for p in np.flatnonzero(inside):
             cell = (k * n_x + x[p]) * cells.N_WEDGES + wedge[p]
             rows = listed_corners(found, k, cell)
