@@ -167,7 +167,7 @@ def _sort(axis: Axis, surface: Triangles, boxes: Boxes, block_length: float, n_x
     cell, entry, vertex = zip(*parts, strict=True)
     first_vertex = np.cumsum([0, *(len(words) for words in vertex[:-1])])
     cells, entries, vertices = (np.concatenate(part).astype(np.uint32).view(np.int32) for part in (cell, entry, vertex))
-    prism = np.array([_empty_prism(points[faces][..., 1:]) for points, faces in local])
+    prism = np.array([_empty_prism(points[:, 1:], faces) for points, faces in local])
     first_box = np.cumsum([0, *(len(parts) for parts in chosen_boxes)])
     placed = [boxes.pick(parts).seen_from(blocks.centre[k], blocks.turn[k]) for k, parts in enumerate(chosen_boxes)]
     top = np.array([float(part.corners()[..., 2].max(initial=-1e6)) for part in placed])
@@ -364,15 +364,15 @@ def _clip(
     return x, y * middle[0] + z * middle[1], np.concatenate(inside)
 
 
-def _empty_prism(corner: Float[np.ndarray, "t 3 2"]) -> Float[np.ndarray, n_faces]:
+def _empty_prism(points: Float[np.ndarray, "v 2"], faces: Int[np.ndarray, "t 3"]) -> Float[np.ndarray, n_faces]:
     """Return the distances of a prism's faces from the axis, m: no triangle reaches into the prism.
 
     Each triangle stays behind one of the faces, the one for which that costs the least.
     """
     distance = np.full(N_FACES, 1e6)
-    if len(corner):
-        along = np.einsum("tki,fi->kft", corner, FACES)
-        nearest = along.min(axis=0)
-        face = np.argmax(nearest - along.max(axis=(0, 2))[:, None], axis=0)
+    if len(faces):
+        along = FACES @ points.T
+        nearest = np.minimum(np.minimum(along[:, faces[:, 0]], along[:, faces[:, 1]]), along[:, faces[:, 2]])
+        face = np.argmax(nearest - along.max(axis=1)[:, None], axis=0)
         np.minimum.at(distance, face, nearest[face, np.arange(len(face))] - MARGIN)
     return distance
