@@ -23,7 +23,6 @@ class Forgetful(Memory):
     """As `along`, but the way to go is dead-reckoned."""
 
     def _look(self, reckoned: Reckoned, located: Located | None, obs: Observed, params: EnvParams) -> Array:
-        del located
         way = inputs.way_to_go(reckoned, obs, params)
         return jnp.append(inputs.look(reckoned, obs, way, params, self.relief), 0.0)
 
