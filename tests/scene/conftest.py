@@ -64,5 +64,5 @@ def arc_scene(bore, tmp_path_factory) -> tuple[Path, Track, dict[str, int]]:
 def bore_file(tmp_path_factory) -> Path:
     """A cloud of 24 m of a curved D-shaped bore."""
     path = tmp_path_factory.mktemp("cloud") / "bore.ply"
-    trimesh.PointCloud(curved_d_bore(length=24, per_metre=4000, offset=(12.0, -3.0, 2.0)).points).export(path)
+    trimesh.PointCloud(curved_d_bore(length=24, per_metre=2000, offset=(12.0, -3.0, 2.0)).points).export(path)
     return path

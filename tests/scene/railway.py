@@ -44,6 +44,12 @@ class World:
     grade: float = 0.01
     hole: tuple[float, float] | None = None  # stretch of the floor from which nothing comes back, m
 
+    @property
+    def middle(self) -> tuple[np.ndarray, np.ndarray]:
+        """The ends of the line through mid-width and mid-height, m."""
+        half = self.outline[:, 1].max() / 2
+        return np.array([0.0, 0.0, half]) + PLACE, np.array([self.length, 0.0, half + self.grade * self.length]) + PLACE
+
     def _mesh(self) -> trimesh.Trimesh:
         around, count = self.outline, len(self.outline)
         ends = [np.column_stack([np.full(count, x), around]) for x in (0.0, self.length)]

@@ -36,6 +36,13 @@ def swept(kind: str, length: float, yaw: float, start: float = 0.0, per_metre: i
     return points + rng.normal(0, 0.008, points.shape) + PLACE
 
 
+def midline(kind: str, length: float, yaw: float) -> tuple[np.ndarray, np.ndarray]:
+    """The ends of the line through mid-width and mid-height of a `swept` bore, m."""
+    up = outline(kind)[:, 1]
+    middle = PLACE + np.array([0.0, 0.0, (up.min() + up.max()) / 2])
+    return middle, middle + length * np.array([np.cos(yaw), np.sin(yaw), 0.01])
+
+
 @dataclass(frozen=True)
 class Tube:
     """A D-shaped bore between two points of the plan."""

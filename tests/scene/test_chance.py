@@ -6,9 +6,8 @@ import pytest
 from scene.bore import POCKET
 from scene.fitting import pockets, trackseen
 from scene.fitting.evidence import more_than_chance, steadier_than_chance
-from scene.fitting.section import fit_sections
 from tests.scene.clouds import curved_d_bore
-from tests.scene.fits import axis_of, thin
+from tests.scene.fits import fitted, thin
 from tests.scene.scanned import arch, pillar, scan, with_outliers
 
 PITCHES = (0.9, 2.1)
@@ -24,10 +23,13 @@ def strewn() -> np.ndarray:
     return with_outliers(known.points, 0.01)
 
 
-@pytest.mark.parametrize("cloud", [pillared, strewn])
-def test_no_ring_and_no_pocket_is_measured_where_there_is_none(cloud, monkeypatch):
+@pytest.mark.parametrize(
+    ("cloud", "line"),
+    [(pillared, np.array([[0.0, 0.0, 3.5], [24.0, 0.0, 3.5]])), (strewn, np.array([[0.0] * 3, [60.0, 0.0, 0.0]]))],
+)
+def test_no_ring_and_no_pocket_is_measured_where_there_is_none(cloud, line, monkeypatch):
     thinned = thin(cloud())
-    sections = fit_sections(thinned, axis_of(thinned))
+    sections = fitted(thinned, line)[1]
     found, joints = pockets.find_pockets(sections)
     assert len(found) == len(joints) == 0
     monkeypatch.setattr(pockets, "open_rims", lambda deficit, grid, row, *rest: np.zeros(len(row)))

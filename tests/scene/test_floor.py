@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from scene.bore import Bore
-from scene.fitting import floor
+from scene.fitting import floor, floorline
 from scene.fitting.section import fit_sections
 from tests.scene import railway
-from tests.scene.fits import axis_of, fitted, thin
+from tests.scene.fits import fitted, straight, thin
 from tests.scene.railway import World, arch
 from tests.scene.shapes import PLACE
 
@@ -31,10 +31,10 @@ SCANS = {
 }
 
 
-def built(points: np.ndarray, voxel: float) -> tuple[Bore, np.ndarray]:
+def built(world: World, points: np.ndarray, voxel: float) -> tuple[Bore, np.ndarray]:
     """The bore, and how much its floor on the axis lies too high at each station, m."""
     cloud = thin(points, voxel)
-    bore = fitted(cloud)[0]
+    bore = fitted(cloud, world.middle)[0]
     foot = bore.position - bore.toward(-np.pi / 2)[:, None] * bore.up + cloud.origin - PLACE
     return bore, foot[:, 2] - 0.01 * foot[:, 0]
 
@@ -58,7 +58,7 @@ SLOW = pytest.mark.slow
     ids=["proud-vlp16", "proud-os1", "proud", "double-vlp16", "double", "kerbs", "walkway", "platform", "drain"],
 )
 def test_floor_and_height_are_right_under_track_and_beside_walkways(world, sensor):
-    bore, error = built(SCANS[sensor](world), 0.07 if sensor == "terrestrial" else 0.04)
+    bore, error = built(world, SCANS[sensor](world), 0.07 if sensor == "terrestrial" else 0.04)
     within = slice(8, -8)  # a carried scanner sees no floor at a mouth
     assert np.abs(error[within]).max() < 0.03
     assert np.median(bore.height) == pytest.approx(world.outline[:, 1].max(), abs=0.03)
@@ -68,26 +68,29 @@ def test_floor_and_height_are_right_under_track_and_beside_walkways(world, senso
 @pytest.mark.slow
 def test_sleepers_that_stand_out_little_do_not_lift_the_ballast(monkeypatch):
     low = [box for aside in (-2.0, 2.0) for box in railway.sleepers(SPACED, 0.06, aside)]
-    points = SCANS["os1"](World(arch(8.7, 6.6, 3.0), L, low))
-    assert abs(np.median(built(points, 0.04)[1][8:-8])) < 0.008
-    monkeypatch.setattr(floor, "_PEAK_HALF", 0.0)  # which leaves the line where it was
-    assert np.median(built(points, 0.04)[1][8:-8]) > 0.008
+    world = World(arch(8.7, 6.6, 3.0), L, low)
+    points = SCANS["os1"](world)
+    assert abs(np.median(built(world, points, 0.04)[1][8:-8])) < 0.008
+    monkeypatch.setattr(floorline, "_PEAK_HALF", 0.0)  # which leaves the line where it was
+    assert np.median(built(world, points, 0.04)[1][8:-8]) > 0.008
 
 
 def test_a_thin_cloud_shows_the_floor_between_sleepers_in_longer_windows(monkeypatch):
-    points = SCANS["terrestrial"](World(arch(5.1, 5.5, 3.0), L, PROUD))
+    world = World(arch(5.1, 5.5, 3.0), L, PROUD)
+    points = SCANS["terrestrial"](world)
     thin = points[np.random.default_rng(3).permutation(len(points))[:5_000]]  # 10 a square metre
-    assert np.abs(built(thin, 0.07)[1][8:-8]).max() < 0.03
+    assert np.abs(built(world, thin, 0.07)[1][8:-8]).max() < 0.03
     monkeypatch.setattr(floor, "_LONGEST_WINDOW", 0.0)
-    assert np.abs(built(thin, 0.07)[1][8:-8]).max() > 0.05
+    assert np.abs(built(world, thin, 0.07)[1][8:-8]).max() > 0.05
 
 
 def test_ghosts_of_a_walker_do_not_lift_the_floor():
-    points, rng = SCANS["vlp16"](World(arch(5.5, 6.0, 3.2), L)), np.random.default_rng(1)
+    world, rng = World(arch(5.5, 6.0, 3.2), L), np.random.default_rng(1)
+    points = SCANS["vlp16"](world)
     count = int(0.12 * len(points))
     x = rng.uniform(0, L, count)
     ghosts = np.column_stack([x, rng.normal(0, 0.25, count), rng.uniform(0.1, 1.8, count) + 0.01 * x]) + PLACE
-    assert np.abs(built(np.concatenate([points, ghosts]), 0.04)[1]).max() < 0.03
+    assert np.abs(built(world, np.concatenate([points, ghosts]), 0.04)[1]).max() < 0.03
 
 
 def test_the_floor_runs_on_straight_under_a_train_and_through_a_gap():
@@ -97,13 +100,14 @@ def test_the_floor_runs_on_straight_under_a_train_and_through_a_gap():
         train.scan(railway.terrestrial(), beside, 0.004),
         SCANS["terrestrial"](World(arch(5.5, 6.0, 3.2), 40.0, hole=(14.0, 24.0))),
     ):
-        assert np.abs(built(points, 0.07)[1]).max() < 0.05
+        assert np.abs(built(train, points, 0.07)[1]).max() < 0.05
 
 
 def test_a_walkway_stays_beside_the_floor_and_what_stands_there_for_a_metre_goes():
-    sides = [(0, L, 3.8, 4.8, 0, 0.2)]
-    kerbed, _ = built(SCANS["terrestrial"](World(arch(9.6, 7.0, 4.0), L, sides)), 0.07)
-    boxed, _ = built(SCANS["terrestrial"](World(arch(9.6, 7.0, 4.0), L, [(12, 13, 3.8, 4.8, 0, 0.2)])), 0.07)
+    kerbed, boxed = (
+        built(world, SCANS["terrestrial"](world), 0.07)[0]
+        for world in (World(arch(9.6, 7.0, 4.0), L, [(*along, 3.8, 4.8, 0, 0.2)]) for along in ((0, L), (12, 13)))
+    )
 
     def foot(bore: Bore) -> float:
         """Height above the floor 4.3 m aside, on the higher side, m."""
@@ -119,8 +123,7 @@ def test_a_round_invert_is_no_floor():
     turn = np.linspace(-np.pi, np.pi, 200)[:-1]
     tube = World(np.column_stack([2.7 * np.cos(turn), 2.7 + 2.7 * np.sin(turn)]), L)
     cloud = thin(SCANS["vlp16"](tube))
-    axis = axis_of(cloud)
-    assert not fit_sections(cloud, axis).flat_floor
+    assert not fit_sections(cloud, straight(cloud, tube.middle)).flat_floor
 
 
 def test_an_even_run_leaves_out_what_stands_on_the_floor_and_takes_the_lower_of_two():
@@ -134,7 +137,8 @@ def test_an_even_run_leaves_out_what_stands_on_the_floor_and_takes_the_lower_of_
 
 def test_without_the_search_below_the_floor_would_be_a_plateau_over_the_track(monkeypatch):
     monkeypatch.setattr(floor, "find_lower_line", lambda *_: None)
-    _, error = built(SCANS["vlp16"](World(arch(5.1, 5.5, 3.0), L, PROUD)), 0.04)
+    world = World(arch(5.1, 5.5, 3.0), L, PROUD)
+    _, error = built(world, SCANS["vlp16"](world), 0.04)
     assert np.median(error) > 0.1
 
 

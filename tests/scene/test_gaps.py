@@ -8,7 +8,7 @@ from scene.fitting.assemble import find_fold, fit_unfolded
 from scene.fitting.unroll import fill_sides
 from scene.geometry import axis_through
 from tests.scene import railway
-from tests.scene.fits import bore_about, cleaned, thin
+from tests.scene.fits import bore_about, fitted, thin
 from tests.scene.railway import World, arch
 from tests.scene.shapes import PLACE
 
@@ -45,10 +45,10 @@ def test_a_wall_goes_on_to_an_end_as_it_was_before_and_no_further_than_told():
 def test_the_bore_keeps_its_width_where_a_scan_ends_aslant(monkeypatch):
     points = ARCH.scan(railway.terrestrial(), railway.stations(L), 0.004) - PLACE
     unseen = (points[:, 1] > -1.0) & (points[:, 0] > L - 0.9 - 0.2 * points[:, 1])
-    bore = cleaned(thin(points[~unseen] + PLACE, 0.07))
+    cloud = thin(points[~unseen] + PLACE, 0.07)
 
     def off() -> float:
-        return float(np.abs(bore_about(bore.axis, bore.cloud).width - 5.5).max())
+        return float(np.abs(fitted(cloud, ARCH.middle)[0].width - 5.5).max())
 
     assert off() < 0.03
     monkeypatch.setattr(section, "_GOES_ON", 0.0)
@@ -58,10 +58,10 @@ def test_the_bore_keeps_its_width_where_a_scan_ends_aslant(monkeypatch):
 def test_a_wall_that_nobody_saw_stands_straight_between_crown_and_floor(monkeypatch):
     points = ARCH.scan(railway.terrestrial(), railway.stations(L), 0.004) - PLACE
     unseen = (points[:, 1] > 2.70) & (points[:, 2] - 0.01 * points[:, 0] < 3.2)
-    bore = cleaned(thin(points[~unseen] + PLACE, 0.07))
+    cloud = thin(points[~unseen] + PLACE, 0.07)
 
     def width() -> np.ndarray:
-        return bore_about(bore.axis, bore.cloud).width[8:-8]
+        return fitted(cloud, ARCH.middle)[0].width[8:-8]
 
     assert np.abs(width() - 5.5).max() < 0.10
     monkeypatch.setattr(section, "fill_sides", lambda wall, angle, reach: wall)

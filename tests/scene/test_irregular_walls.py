@@ -13,6 +13,7 @@ from tests.scene.fits import rebuilt
 
 LENGTH, SPACING, STEP, COLUMNS = 30.0, 1.0, 0.1, 180
 SD = 0.13
+LINE = (np.full(3, 50.0), np.array([50.0 + LENGTH, 50.0, 50.0]))
 BEFORE = 5.0  # m of relief before the first station, so that nothing depends on an edge
 
 
@@ -95,8 +96,8 @@ def test_a_person_between_two_profiles_is_no_wall():
     profiles = np.arange(0.3, LENGTH, SPACING)
     cloud = np.concatenate([tunnel.profile(station, 2500, rng) for station in profiles])
     person = np.array([15.3, 1.6, -1.2]) + rng.normal(0, [0.02, 0.12, 0.4], (500, 3))
-    alone, _ = rebuilt(cloud + 50.0)
-    beside, _ = rebuilt(np.concatenate([cloud, person]) + 50.0)
+    alone, _ = rebuilt(cloud + 50.0, LINE)
+    beside, _ = rebuilt(np.concatenate([cloud, person]) + 50.0, LINE)
     assert np.abs(alone.width - beside.width).max() < 0.06
 
 

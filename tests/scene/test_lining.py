@@ -7,14 +7,13 @@ import pytest
 
 from scene.bore import STRETCH, Bore, load_bore
 from scene.cloud import Cloud
-from scene.fitting.assemble import bore_from_sections
 from scene.fitting.lining import LiningConfig, add_lining, add_standard_lining, count_alone, make_nails, pair_pockets
-from scene.fitting.section import fit_sections
-from tests.scene.fits import axis_of, thin
-from tests.scene.shapes import swept
+from tests.scene.fits import Line, fitted, thin
+from tests.scene.shapes import midline, swept
 from tests.scene.test_irregular_walls import Irregular
 
 RADIUS, LENGTH, RING = 2.75, 18.0, 1.5
+LINE = (np.full(3, 40.0), np.array([40.0 + LENGTH, 40.0, 40.0]))
 JOINTS = np.arange(0.75, LENGTH, RING)
 ROWS = np.deg2rad([-30.0, 10.0, 50.0, 90.0, 130.0, 170.0, 210.0])
 OFFSET, HALF, DEPTH, NAIL = 0.22, (0.10, 0.09), 0.13, 0.06
@@ -41,16 +40,16 @@ def lined(nails: bool) -> np.ndarray:
     return points + rng.normal(0, 0.004, points.shape) + 40.0
 
 
-def built(points: np.ndarray, config: LiningConfig | None = None) -> tuple[Bore, dict[str, str], Cloud]:
+def built(
+    points: np.ndarray, config: LiningConfig | None = None, line: Line | None = None
+) -> tuple[Bore, dict[str, str], Cloud]:
     cloud = thin(points)
-    axis = axis_of(cloud)
-    sections = fit_sections(cloud, axis)
-    return *add_lining(bore_from_sections(axis, sections), sections, cloud, config), cloud
+    return *add_lining(*fitted(cloud, line), cloud, config), cloud
 
 
 @pytest.fixture(scope="module")
 def with_nails():
-    return built(lined(nails=True))
+    return built(lined(nails=True), line=LINE)
 
 
 def test_pockets_are_measured_with_place_size_and_depth(with_nails):
@@ -93,14 +92,14 @@ def test_every_pocket_is_joined_to_the_next_of_its_joint_and_those_alone_are_cou
 
 
 def test_empty_pockets_have_no_nails():
-    bore, provenance, _ = built(lined(nails=False))
+    bore, provenance, _ = built(lined(nails=False), line=LINE)
     assert provenance["pockets"] == "measured"
     assert provenance["nails"] == "none found"
     assert not len(bore.nail)
 
 
 def test_a_smooth_wall_seen_well_gets_nothing():
-    bore, provenance, _ = built(swept("circle", 18, yaw=0.4, per_metre=9000))
+    bore, provenance, _ = built(swept("circle", 18, yaw=0.4, per_metre=9000), line=midline("circle", 18, yaw=0.4))
     assert set(provenance.values()) == {"none found"}
     assert not len(bore.pocket)
     assert not len(bore.ring_station)
@@ -109,7 +108,8 @@ def test_a_smooth_wall_seen_well_gets_nothing():
 def test_a_wall_seen_too_thinly_gets_the_standard_lining_on_request_marked_so(tmp_path):
     points = swept("circle", 30, yaw=0.4)
     along = (points - points.mean(axis=0))[:, :2] @ [np.cos(0.4), np.sin(0.4)]
-    bore, provenance, _ = built(points[np.abs(along - np.rint(along)) < 0.05], LiningConfig(lay="standard"))
+    sparse, line = points[np.abs(along - np.rint(along)) < 0.05], midline("circle", 30, yaw=0.4)
+    bore, provenance, _ = built(sparse, LiningConfig(lay="standard"), line)
     assert provenance == {"rings": "by standard", "pockets": "by standard", "nails": "by standard"}
     assert len(bore.pocket) == 2 * 8 * len(bore.ring_station)
     assert len(bore.nail) == 8 * len(bore.ring_station)
@@ -143,7 +143,7 @@ def test_the_standard_lining_can_be_chosen():
     along = (points - points.mean(axis=0))[:, :2] @ [np.cos(0.4), np.sin(0.4)]
     sparse = points[np.abs(along - np.rint(along)) < 0.05]
     chosen = LiningConfig(lay="standard", ring_width=2.0, pockets_per_ring=5, stagger=0.5, pocket_size=(0.25, 0.2))
-    bore, _, _ = built(sparse, chosen)
+    bore, _, _ = built(sparse, chosen, midline("circle", 30, yaw=0.4))
     assert np.diff(bore.ring_station) == pytest.approx(2.0)
     assert len(bore.pocket) == 10 * len(bore.ring_station)
     assert (bore.pocket["length"] == 0.25).all()

@@ -11,6 +11,8 @@ from scene.fitting.section import fit_sections
 from tests.scene.clouds import KnownBore, curved_d_bore
 from tests.scene.fits import axis_of, rebuilt, thin
 
+STRAIGHT = np.array([[0.0] * 3, [30.0, 0.0, 0.0]])
+
 
 def offsets(bore: Bore, cloud: Cloud, known: KnownBore) -> tuple[np.ndarray, np.ndarray]:
     centre = known.centre - cloud.origin
@@ -20,7 +22,7 @@ def offsets(bore: Bore, cloud: Cloud, known: KnownBore) -> tuple[np.ndarray, np.
 
 @pytest.mark.parametrize("yaw", [0.0, 2.3, -1.6])
 def test_a_curved_d_bore_is_measured_in_any_orientation(yaw):
-    known = curved_d_bore(yaw=yaw)
+    known = curved_d_bore(yaw=yaw, per_metre=2000)
     bore, cloud = rebuilt(known.points)
     lateral, vertical = offsets(bore, cloud, known)
     assert np.sqrt(np.mean(lateral**2)) < 0.01
@@ -32,7 +34,7 @@ def test_a_curved_d_bore_is_measured_in_any_orientation(yaw):
 
 
 def test_frames_are_orthonormal_and_lateral_points_left():
-    bore, _ = rebuilt(curved_d_bore(length=20).points)
+    bore, _ = rebuilt(curved_d_bore(length=20, per_metre=1500).points)
     np.testing.assert_allclose(np.cross(bore.up, bore.tangent), bore.lateral, atol=1e-12)
     np.testing.assert_allclose(bore.lateral[:, 2], 0, atol=1e-12)
     steps = np.diff(bore.position, axis=0)
@@ -51,7 +53,7 @@ def test_rails_and_people_do_not_move_floor_or_walls():
         axis=1,
     )
     person = np.array([15.0, 1.6, -2.3]) + rng.normal(0, [0.15, 0.15, 0.4], (4000, 3))
-    bore, _ = rebuilt(np.concatenate([known.points, rails, person]))
+    bore, _ = rebuilt(np.concatenate([known.points, rails, person]), STRAIGHT)
     assert np.abs(bore.width - known.width).max() < 0.05
     assert np.abs(bore.height - known.height).max() < 0.05
 
@@ -59,7 +61,7 @@ def test_rails_and_people_do_not_move_floor_or_walls():
 def test_a_hole_in_the_survey_is_filled_and_marked():
     known = curved_d_bore(length=30, radius=1e6, grade=0.0, yaw=0.0, offset=(0, 0, 0))
     gone = (np.abs(known.points[:, 0] - 15) < 0.4) & (known.points[:, 2] > -2.5)
-    bore, _ = rebuilt(known.points[~gone])
+    bore, _ = rebuilt(known.points[~gone], STRAIGHT)
     at_hole = np.abs(bore.position[:, 0] + np.floor(np.median(known.points[:, 0])) - 15) < 0.2
     assert bore.filled[at_hole].all()
     assert np.abs(bore.width[at_hole] - known.width).max() < 0.05

@@ -6,7 +6,7 @@ import pytest
 from scene.bore import load_bore
 from tests.scene.clouds import curved_d_bore
 from tests.scene.fits import rebuilt
-from tests.scene.shapes import swept
+from tests.scene.shapes import midline, swept
 
 
 @pytest.mark.parametrize(
@@ -20,7 +20,7 @@ from tests.scene.shapes import swept
     ],
 )
 def test_a_section_is_told_with_its_radii(kind, expected, crown, wall):
-    bore, _ = rebuilt(swept(kind, 24, yaw=0.8))
+    bore, _ = rebuilt(swept(kind, 24, yaw=0.8), midline(kind, 24, yaw=0.8))
     assert len(bore.stretch) == 1
     (stretch,) = bore.stretch
     assert stretch["type"] == expected
@@ -32,7 +32,7 @@ def test_a_section_is_told_with_its_radii(kind, expected, crown, wall):
 
 def test_a_change_of_section_is_found_where_it_is():
     points = np.concatenate([swept("horseshoe", 20, yaw=-1.0), swept("d", 20, yaw=-1.0, start=20.0)])
-    bore, _ = rebuilt(points)
+    bore, _ = rebuilt(points, midline("d", 40, yaw=-1.0))
     assert list(bore.stretch["type"]) in (["horseshoe", "d"], ["d", "horseshoe"])
     assert bore.stretch["end"][0] == pytest.approx(20, abs=2.1)
     assert set(bore.section_type) == {"horseshoe", "d"}
@@ -53,5 +53,5 @@ def test_curvature_grade_and_types_are_in_the_bore_file(tmp_path):
 
 
 def test_confidence_is_high_on_a_wall_that_was_seen():
-    bore, _ = rebuilt(swept("circle", 20, yaw=0.1))
+    bore, _ = rebuilt(swept("circle", 20, yaw=0.1), midline("circle", 20, yaw=0.1))
     assert bore.confidence.min() > 0.99

@@ -7,13 +7,13 @@ import pytest
 
 from scene.bore import POCKET, Bore
 from scene.fitting import pockets
-from scene.fitting.assemble import bore_from_sections
 from scene.fitting.evidence import turned_more_than_chance
 from scene.fitting.lining import add_lining, pair_pockets
-from scene.fitting.section import Sections, fit_sections
+from scene.fitting.section import Sections
 from scene.fitting.turned import find_ring
 from scene.fitting.unroll import Grid
-from tests.scene.fits import axis_of, thin
+from tests.scene import fits
+from tests.scene.fits import thin
 
 RADIUS, LENGTH, RING, FIRST = 2.75, 24.0, 1.5, 0.4
 HALF, DEPTH, ASIDE = (0.10, 0.09), 0.12, 0.25
@@ -48,12 +48,14 @@ def cloud_of(step: float, anywhere: bool = False) -> tuple[np.ndarray, np.ndarra
     return points + rng.normal(0.0, 0.004, points.shape) + 40.0, place
 
 
+def line(length: float) -> fits.Line:
+    return np.full(3, 40.0), np.array([40.0 + length, 40.0, 40.0])
+
+
 def fitted(points: np.ndarray) -> tuple[Bore, Sections, np.ndarray]:
     """Smooth bore, sections, and origin of their frame, m."""
     cloud = thin(points)
-    axis = axis_of(cloud)
-    sections = fit_sections(cloud, axis)
-    return bore_from_sections(axis, sections), sections, np.asarray(cloud.origin)
+    return *fits.fitted(cloud, line(LENGTH)), np.asarray(cloud.origin)
 
 
 def built(points: np.ndarray) -> tuple[Bore, dict[str, str], np.ndarray]:

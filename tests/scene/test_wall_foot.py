@@ -6,7 +6,7 @@ from shapely import LineString, points
 
 from scene.fitting.unroll import median_smooth
 from tests.scene.fits import rebuilt
-from tests.scene.shapes import PLACE, outline, swept
+from tests.scene.shapes import PLACE, midline, outline, swept
 
 RAILS, RAIL_TOP = 0.75, 0.24
 
@@ -21,7 +21,7 @@ def with_rails(cloud: np.ndarray, floor: float) -> np.ndarray:
 @pytest.mark.parametrize("kind", ["d", "horseshoe", "circle on a floor"])
 def test_the_corner_of_wall_and_floor_is_not_cut_off(kind):
     section = outline(kind)
-    bore, cloud = rebuilt(with_rails(swept(kind, 24.0, yaw=0.0), section[:, 1].min()))
+    bore, cloud = rebuilt(with_rails(swept(kind, 24.0, yaw=0.0), section[:, 1].min()), midline(kind, 24.0, yaw=0.0))
     surface = bore.surface()[8:-8] + cloud.origin - PLACE
     wall = np.stack([surface[..., 1], surface[..., 2] - 0.01 * surface[..., 0]], axis=-1).reshape(-1, 2)
     true = LineString(section[np.argsort(np.arctan2(*section.T[::-1]))])

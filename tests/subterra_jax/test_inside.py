@@ -38,6 +38,10 @@ def test_no_mouth_is_in_sight_of_a_start_or_a_goal(name, hidden):
     assert float(distance.min()) == pytest.approx(60.0, abs=1.0)
     assert float(distance.max()) == pytest.approx(room, abs=1.0)
     assert float(distance.mean()) == pytest.approx(0.5 * (60.0 + room), rel=0.03)
+    left = length - 80.0 - distance  # for the start to lie in
+    share = ((state.goal.told - 40.0) / left)[left > 20.0]
+    assert float(share.mean()) == pytest.approx(0.5, abs=0.03)
+    assert float(share.max()) == pytest.approx(1.0, abs=0.05)
 
 
 def test_no_mouth_comes_into_sight_within_the_travel_of_a_relocalisation():

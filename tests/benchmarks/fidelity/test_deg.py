@@ -1,9 +1,11 @@
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from benchmarks.fidelity.case import Case
+from benchmarks.fidelity.categories import sensor
 from benchmarks.fidelity.derive.degeneracy import alias_ratios, information, localised_stations
 from benchmarks.fidelity.faults import Fault, Site, put_in
 from tests.benchmarks.fidelity import tube
@@ -48,6 +50,15 @@ def test_a_planar_scan_is_lost_between_smooth_walls_and_found_between_pilasters(
     pilasters = _planar(tmp_path / "pockets.npz", stepped, "pockets")
     assert localised_stations(pilasters).mean() > 0.5
     assert raw("deg_planar_axial_info", pilasters) == localised_stations(pilasters).mean()
+
+
+def test_a_scan_near_the_cut_counts_by_the_probability_that_it_lies_beyond(monkeypatch):
+    """One standard deviation above and below the cut: 84 % and 16 % of a normal distribution."""
+    deviation, weakest = 0.05, np.full((20, 3), 1.0)  # of log10
+    scans = {real: SimpleNamespace(axial=np.full(20, 10.0 ** (sign * deviation) / 10.0), translation=weakest)
+             for real, sign in ((True, 1.0), (False, -1.0))}  # fmt: skip
+    monkeypatch.setattr(sensor, "information", lambda case, real: scans[real])
+    assert sensor.deg_landmark_diff(None).value == pytest.approx(100.0 * (0.8413 - 0.1587), abs=0.01)
 
 
 def test_half_of_the_beams_are_as_informed():

@@ -91,6 +91,12 @@ def test_a_relief_is_found_where_it_was_moved_to_and_points_beyond_its_ends_coun
     assert np.isnan(shift_by_window(at, angle, np.full(len(at), 2.5), smooth, starts, 10.0)).all()
 
 
+def test_a_wall_far_out_counts_as_half_a_metre(good) -> None:
+    found = with_fault(good, Fault("wall", 0.9, 8.0, 5.0, 0.0))
+    for name in ("spot.truth", "spot.recording"):
+        assert found[name].value == pytest.approx(0.5, abs=0.01), name
+
+
 def test_filled_pockets_lost_sleepers_and_a_cube_are_noticed(good) -> None:
     for fault, window in (
         (Fault("pockets", 0.9, 8.0, 7.0), "pockets.truth"),
