@@ -43,73 +43,45 @@ _PROG = "python -m benchmarks.fidelity"
 
 @dataclass(frozen=True)
 class RunConfig(Inputs):
-    """Run of the suite.
+    """Run of the suite."""
 
-    Attributes:
-        processes: With 2, half of the categories are scored in a second process.
-    """
-
-    processes: int = 2
+    processes: int = 2  # With 2, half of the categories are scored in a second process.
 
 
 @dataclass(frozen=True)
 class ControlsConfig(Inputs):
-    """Controls to run.
+    """Controls to run."""
 
-    Attributes:
-        only: Ids of the controls; all where empty.
-        bold_only: Run only the doses that must fail.
-        processes: Number of controls at a time.
-        foreign: Scene folder of another tunnel of the same class, for N33; made where not given.
-    """
-
-    only: tuple[str, ...] = ()
-    bold_only: bool = False
-    processes: int = 2
-    foreign: Path | None = None
+    only: tuple[str, ...] = ()  # Ids of the controls; all where empty.
+    bold_only: bool = False  # Run only the doses that must fail.
+    processes: int = 2  # Number of controls at a time.
+    foreign: Path | None = None  # Scene folder of another tunnel of the same class, for N33; made where not given.
 
 
 @dataclass(frozen=True)
 class SweepConfig(Inputs):
-    """Runs of the sweep that compute all geometry anew.
+    """Runs of the sweep that compute all geometry anew."""
 
-    Attributes:
-        seeds: Seeds of such runs; empty for none.
-        tolerances: Factors on the tolerances inside metrics; empty for none.
-    """
-
-    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
-    tolerances: tuple[float, ...] = (0.9, 1.1)
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)  # Seeds of such runs; empty for none.
+    tolerances: tuple[float, ...] = (0.9, 1.1)  # Factors on the tolerances inside metrics; empty for none.
 
 
 @dataclass(frozen=True)
 class FaultsConfig(Inputs):
-    """Faults to draw.
+    """Faults to draw."""
 
-    Attributes:
-        draw: Seed that draws their places.
-        kinds: Kinds to put in; all that a size is asked of where empty.
-        places: Number of places of each kind.
-    """
-
-    draw: int = 0
-    kinds: tuple[str, ...] = ()
-    places: int = 6
+    draw: int = 0  # Seed that draws their places.
+    kinds: tuple[str, ...] = ()  # Kinds to put in; all that a size is asked of where empty.
+    places: int = 6  # Number of places of each kind.
 
 
 @dataclass(frozen=True)
 class SplitCommand:
-    """Cut a recording into fit, val and hold by blocks of time.
+    """Cut a recording into fit, val and hold by blocks of time."""
 
-    Attributes:
-        recording: Bag to cut.
-        out: Folder to write.
-        rule: Rule of the cut.
-    """
-
-    recording: tyro.conf.Positional[Path]
-    out: Path
-    rule: SplitConfig = field(default_factory=SplitConfig)
+    recording: tyro.conf.Positional[Path]  # Bag to cut.
+    out: Path  # Folder to write.
+    rule: SplitConfig = field(default_factory=SplitConfig)  # Rule of the cut.
 
 
 @dataclass(frozen=True)

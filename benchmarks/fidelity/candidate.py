@@ -16,21 +16,14 @@ from benchmarks.fidelity.meshes import concatenate_meshes
 
 @dataclass(frozen=True)
 class Track:
-    """Track of the compiled scene, tunnel frame.
+    """Track of the compiled scene, tunnel frame."""
 
-    Attributes:
-        sleeper: Middle of the top of each sleeper, in the order of the file, m, `(s, 3)`.
-        sleeper_mesh: Mesh of all sleepers.
-        rail: Inner face of the rail head at its top, along the rail, by side (`left`, `right`), m, `(k, 3)`.
-        rail_mesh: Mesh of all rails.
-        fastening_mesh: Mesh of pads, clips and shoulders.
-    """
-
-    sleeper: Float[np.ndarray, "s 3"]
-    sleeper_mesh: trimesh.Trimesh
+    sleeper: Float[np.ndarray, "s 3"]  # Middle of the top of each sleeper, in the order of the file, m, `(s, 3)`
+    sleeper_mesh: trimesh.Trimesh  # Mesh of all sleepers
+    # Inner face of the rail head at its top, along the rail, by side (`left`, `right`), m, `(k, 3)`
     rail: dict[str, Float[np.ndarray, "k 3"]]
-    rail_mesh: trimesh.Trimesh
-    fastening_mesh: trimesh.Trimesh
+    rail_mesh: trimesh.Trimesh  # Mesh of all rails
+    fastening_mesh: trimesh.Trimesh  # Mesh of pads, clips and shoulders
 
 
 def track_of(geoms: Geoms) -> Track:
@@ -81,34 +74,22 @@ class Bore:
 
 @dataclass(frozen=True)
 class Candidate:
-    """Reconstruction to be judged.
+    """Reconstruction to be judged."""
 
-    Attributes:
-        name: Name for people.
-        folder: Scene folder, which SCN and PAR read.
-        lining: Open bore with its pockets, tunnel frame, m.
-        solid: Watertight air volume.
-        bore: Centreline and sections.
-        track: Sleepers and rails.
-        manifest: Manifest of the scene.
-        scene: The MJCF file, by default the folder's own.
-        tunnel: The planar tunnel of the environment, by default the folder's own.
-        extra: Further visible surfaces (debris, pillars): empty in what the builder made.
-        nails: Bolts that bridge pockets, as the compiled scene holds them.
-        bed: The slab under the track where the compiled scene shows one.
-    """
-
-    name: str
-    folder: Path
-    lining: trimesh.Trimesh
-    solid: trimesh.Trimesh
-    bore: Bore
-    track: Track
-    manifest: dict[str, Any]
-    scene: Path
-    tunnel: Path
+    name: str  # Name for people
+    folder: Path  # Scene folder, which SCN and PAR read
+    lining: trimesh.Trimesh  # Open bore with its pockets, tunnel frame, m
+    solid: trimesh.Trimesh  # Watertight air volume
+    bore: Bore  # Centreline and sections
+    track: Track  # Sleepers and rails
+    manifest: dict[str, Any]  # Manifest of the scene
+    scene: Path  # The MJCF file, by default the folder's own
+    tunnel: Path  # The planar tunnel of the environment, by default the folder's own
+    # Further visible surfaces (debris, pillars): empty in what the builder made
     extra: trimesh.Trimesh = field(default_factory=trimesh.Trimesh)
+    # Bolts that bridge pockets, as the compiled scene holds them
     nails: trimesh.Trimesh = field(default_factory=trimesh.Trimesh)
+    # The slab under the track where the compiled scene shows one
     bed: trimesh.Trimesh = field(default_factory=trimesh.Trimesh)
 
     @property

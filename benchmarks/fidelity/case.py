@@ -25,25 +25,16 @@ _KEPT_UNTIL: dict[tuple[str, str], str] = {}
 
 @dataclass(frozen=True)
 class Case:
-    """Everything that a metric may read.
+    """Everything that a metric may read."""
 
-    Attributes:
-        candidate: The reconstruction to judge.
-        hold: Held-out recording; `None` where there is none.
-        fit: Beams of the recording that the builder read, for `c2m_fit_hold_gap`; `None` where it is not at hand.
-        truth: Truth of the generator; `None` for real data.
-        seed: Seed of sampling, noise and bootstrap.
-        tolerance: Factor on the tolerances inside metrics, for the sweep.
-        cache: Results of `derive` for this case.
-    """
-
-    candidate: Candidate
-    hold: Hold | None = None
+    candidate: Candidate  # The reconstruction to judge
+    hold: Hold | None = None  # Held-out recording; `None` where there is none
+    # Beams of the recording that the builder read, for `c2m_fit_hold_gap`; `None` where it is not at hand
     fit: Hold | None = None
-    truth: Truth | None = None
-    seed: int = 0
-    tolerance: float = 1.0
-    cache: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)
+    truth: Truth | None = None  # Truth of the generator; `None` for real data
+    seed: int = 0  # Seed of sampling, noise and bootstrap
+    tolerance: float = 1.0  # Factor on the tolerances inside metrics, for the sweep
+    cache: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)  # Results of `derive` for this case
 
     def has(self, need: table.Need | None) -> bool:
         """Return True where the reference that something cannot do without is at hand."""

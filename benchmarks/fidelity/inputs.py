@@ -38,35 +38,20 @@ FOREIGN_SEED = 1000
 
 @dataclass(frozen=True)
 class Inputs:
-    """Files to judge and to judge by.
+    """Files to judge and to judge by."""
 
-    Attributes:
-        scene: Scene folder; None is the packaged `subterra-351`, made under `build/`.
-        recording: Held-out recording, which the builder has not read.
-        trajectory: Poses of its LiDAR in the frame of the scene's input, TUM.
-        truth: Folder of a simulated survey, for its truth.json and truth.ply.
-        fit_recording: The recording that the builder read, to compare with.
-        fit_trajectory: Its poses; those of `--trajectory` where not given.
-        hold: Part of a recording to score.
-        seed: Seed of sampling, noise and bootstrap.
-        strict: Count metrics without a reference as 0.
-        partial: Judge only the part that the recording shows.
-        metrics: Python file with metrics and faults of your own, see docs/guide/extend.md.
-        out: Folder for all results.
-    """
-
-    scene: Path | None = None
-    recording: Path | None = None
-    trajectory: Path | None = None
-    truth: Path | None = None
-    fit_recording: Path | None = None
-    fit_trajectory: Path | None = None
-    hold: HoldConfig = field(default_factory=HoldConfig)
-    seed: int = 0
-    strict: bool = False
-    partial: bool = False
-    metrics: Path | None = None
-    out: Path = Path("out/fidelity")
+    scene: Path | None = None  # Scene folder; None is the packaged `subterra-351`, made under `build/`.
+    recording: Path | None = None  # Held-out recording, which the builder has not read.
+    trajectory: Path | None = None  # Poses of its LiDAR in the frame of the scene's input, TUM.
+    truth: Path | None = None  # Folder of a simulated survey, for its truth.json and truth.ply.
+    fit_recording: Path | None = None  # The recording that the builder read, to compare with.
+    fit_trajectory: Path | None = None  # Its poses; those of `--trajectory` where not given.
+    hold: HoldConfig = field(default_factory=HoldConfig)  # Part of a recording to score.
+    seed: int = 0  # Seed of sampling, noise and bootstrap.
+    strict: bool = False  # Count metrics without a reference as 0.
+    partial: bool = False  # Judge only the part that the recording shows.
+    metrics: Path | None = None  # Python file with metrics and faults of your own, see docs/guide/extend.md.
+    out: Path = Path("out/fidelity")  # Folder for all results.
 
 
 def complete_inputs(inputs: Inputs) -> Inputs:
@@ -185,19 +170,12 @@ SPLIT_SCHEMA = "subterra.split/1"
 
 @dataclass(frozen=True)
 class SplitConfig:
-    """Rule of the cut.
+    """Rule of the cut."""
 
-    Attributes:
-        block: Length of a block, s.
-        guard: Left out around every border between parts, s.
-        shares: Shares of fit, val and hold.
-        seed: Seed of the order of the blocks.
-    """
-
-    block: float = 2.0
-    guard: float = 0.2
-    shares: tuple[float, float, float] = (0.6, 0.2, 0.2)
-    seed: int = 0
+    block: float = 2.0  # Length of a block, s.
+    guard: float = 0.2  # Left out around every border between parts, s.
+    shares: tuple[float, float, float] = (0.6, 0.2, 0.2)  # Shares of fit, val and hold.
+    seed: int = 0  # Seed of the order of the blocks.
 
 
 def deal_blocks(duration: float, config: SplitConfig) -> Int[np.ndarray, " b"]:

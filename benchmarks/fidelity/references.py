@@ -118,32 +118,19 @@ TRUTH_SCHEMA = "subterra.truth/1"
 
 @dataclass(frozen=True)
 class Hold:
-    """Beams of a recording that the builder never opened, tunnel frame.
+    """Beams of a recording that the builder never opened, tunnel frame."""
 
-    Attributes:
-        time: Time of each beam, s, `(n,)`.
-        scan: Number of its scan, `(n,)`; beams are in the order of scans.
-        origin: Position of the sensor, m, `(n, 3)`.
-        direction: Unit vectors, `(n, 3)`.
-        range: Distance to the return, m; `inf` where none came back, `(n,)`.
-        sensor: Name of the sensor.
-        sigma: Standard deviation of its range noise by the sensor's data sheet, m.
-        range_max: Reach of the sensor, m.
-        hash: SHA-256 of the recording.
-        knows_missing: True where beams without a return are among the beams.
-        cache: Results computed from this reference alone.
-    """
-
-    time: Float[np.ndarray, " n"]
-    scan: Int[np.ndarray, " n"]
-    origin: Float[np.ndarray, "n 3"]
-    direction: Float[np.ndarray, "n 3"]
-    range: Float[np.ndarray, " n"]
-    sensor: str
-    sigma: float
-    range_max: float
-    hash: str
-    knows_missing: bool = False
+    time: Float[np.ndarray, " n"]  # Time of each beam, s, `(n,)`
+    scan: Int[np.ndarray, " n"]  # Number of its scan, `(n,)`; beams are in the order of scans
+    origin: Float[np.ndarray, "n 3"]  # Position of the sensor, m, `(n, 3)`
+    direction: Float[np.ndarray, "n 3"]  # Unit vectors, `(n, 3)`
+    range: Float[np.ndarray, " n"]  # Distance to the return, m; `inf` where none came back, `(n,)`
+    sensor: str  # Name of the sensor
+    sigma: float  # Standard deviation of its range noise by the sensor's data sheet, m
+    range_max: float  # Reach of the sensor, m
+    hash: str  # SHA-256 of the recording
+    knows_missing: bool = False  # True where beams without a return are among the beams
+    # Results computed from this reference alone
     cache: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)
 
     @property
@@ -160,32 +147,19 @@ class Hold:
 
 @dataclass(frozen=True)
 class Truth:
-    """Exact truth of a simulated survey, tunnel frame.
+    """Exact truth of a simulated survey, tunnel frame."""
 
-    Attributes:
-        station: m, `(n,)`.
-        position: Middle of width and height, m, `(n, 3)`.
-        tangent: Unit vectors, `(n, 3)`.
-        width: Largest inner width, m, `(n,)`.
-        height: Floor to crown, m, `(n,)`.
-        surface: The true surface: lining with pockets, floor, sleepers, rails, fastenings.
-        part: Index into `parts` of each face of `surface`, `(f,)`.
-        parts: Names of the parts.
-        furniture: `rings`, `pockets`, `nails`, `sleepers`, `rails` of `truth.json`, in the survey frame.
-        origin: Point subtracted from the survey frame, m, `(3,)`.
-        cache: Results computed from this reference alone.
-    """
-
-    station: Float[np.ndarray, " n"]
-    position: Float[np.ndarray, "n 3"]
-    tangent: Float[np.ndarray, "n 3"]
-    width: Float[np.ndarray, " n"]
-    height: Float[np.ndarray, " n"]
-    surface: trimesh.Trimesh
-    part: Int[np.ndarray, " f"]
-    parts: tuple[str, ...]
-    furniture: dict[str, Any]
-    origin: Float[np.ndarray, "3"]
+    station: Float[np.ndarray, " n"]  # m, `(n,)`
+    position: Float[np.ndarray, "n 3"]  # Middle of width and height, m, `(n, 3)`
+    tangent: Float[np.ndarray, "n 3"]  # Unit vectors, `(n, 3)`
+    width: Float[np.ndarray, " n"]  # Largest inner width, m, `(n,)`
+    height: Float[np.ndarray, " n"]  # Floor to crown, m, `(n,)`
+    surface: trimesh.Trimesh  # The true surface: lining with pockets, floor, sleepers, rails, fastenings
+    part: Int[np.ndarray, " f"]  # Index into `parts` of each face of `surface`, `(f,)`
+    parts: tuple[str, ...]  # Names of the parts
+    furniture: dict[str, Any]  # `rings`, `pockets`, `nails`, `sleepers`, `rails` of `truth.json`, in the survey frame
+    origin: Float[np.ndarray, "3"]  # Point subtracted from the survey frame, m, `(3,)`
+    # Results computed from this reference alone
     cache: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)
 
     def faces(self, *names: str) -> trimesh.Trimesh:
@@ -196,19 +170,12 @@ class Truth:
 
 @dataclass(frozen=True)
 class HoldConfig:
-    """Part of a held-out recording to score.
+    """Part of a held-out recording to score."""
 
-    Attributes:
-        scan_spacing: Distance that the sensor moves between two scans kept, m.
-        beams_per_scan: Beams kept of a scan at most, evenly spaced in time.
-        sigma: Range noise by the data sheet, m.
-        range_max: Reach, m.
-    """
-
-    scan_spacing: float = 1.0
-    beams_per_scan: int = 6000
-    sigma: float = 0.02
-    range_max: float = 100.0
+    scan_spacing: float = 1.0  # Distance that the sensor moves between two scans kept, m.
+    beams_per_scan: int = 6000  # Beams kept of a scan at most, evenly spaced in time.
+    sigma: float = 0.02  # Range noise by the data sheet, m.
+    range_max: float = 100.0  # Reach, m.
 
 
 def load_hold(recording: Path, trajectory: Path, origin: Float[np.ndarray, "3"], config: HoldConfig) -> Hold:

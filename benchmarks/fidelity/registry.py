@@ -25,23 +25,15 @@ _ABSENT = {
 
 @dataclass(frozen=True)
 class Value:
-    """A raw value of a metric.
+    """A raw value of a metric."""
 
-    Attributes:
-        value: Number in the unit of the table; `None` where there is none.
-        interval: 95 % block-bootstrap interval.
-        n: Number of samples.
-        reason: Cause of a missing value, or remark on the value.
-        failed: The computation broke on this candidate; it scores 0 instead of being left out.
-        extremes: Start, m, and value of the stretches of `BLOCK` with the lowest and with the highest value; `None`
-            where the metric has no values along the tunnel.
-    """
-
-    value: float | None
-    interval: tuple[float, float] | None = None
-    n: int = 0
-    reason: str = ""
-    failed: bool = False
+    value: float | None  # Number in the unit of the table; `None` where there is none
+    interval: tuple[float, float] | None = None  # 95 % block-bootstrap interval
+    n: int = 0  # Number of samples
+    reason: str = ""  # Cause of a missing value, or remark on the value
+    failed: bool = False  # The computation broke on this candidate; it scores 0 instead of being left out
+    # Start, m, and value of the stretches of `BLOCK` with the lowest and with the highest value; `None` where the
+    # metric has no values along the tunnel
     extremes: tuple[tuple[float, float], tuple[float, float]] | None = None
 
 

@@ -26,20 +26,14 @@ _EVIDENCE = {"hold": "H", "truth": "T", "reference": "HT", None: "S"}
 
 @dataclass(frozen=True)
 class Map:
-    """Map from a raw value to a score of 0 to 100.
+    """Map from a raw value to a score of 0 to 100."""
 
-    Attributes:
-        kind: `D` less is better, `U` more is better, `B` near `target` is better, `P` pass or fail, `-` not scored.
-        good: Value from which on the score is 100: the noise floor where the metric has a reference; for `B` a distance
-            from the target.
-        bad: Value from which on the score is 0.
-        target: Best value of a `B` map.
-    """
-
-    kind: str
+    kind: str  # `D` less is better, `U` more is better, `B` near `target` is better, `P` pass or fail, `-` not scored
+    # Value from which on the score is 100: the noise floor where the metric has a reference; for `B` a distance from
+    # the target
     good: float = 0.0
-    bad: float = 0.0
-    target: float = 0.0
+    bad: float = 0.0  # Value from which on the score is 0
+    target: float = 0.0  # Best value of a `B` map
 
     def score(self, value: float) -> float:
         """Return the score; a value that is not a number scores 0."""
@@ -91,34 +85,21 @@ LOGGED, LOGGED_UP = Map("-"), Map("-", good=1.0)  # not scored; the second is be
 
 @dataclass(frozen=True)
 class Metric:
-    """A metric.
+    """A metric."""
 
-    Attributes:
-        number: Place in the order of categories and files, 1 to 199 in the suite.
-        category: Three letters.
-        id: Unique name.
-        definition: Definition in a sentence: the first one of its function's docstring.
-        unit: Unit of value and thresholds. SI: `m`, `1/m`, `1/s`, `1` (a share, ratio or correlation), `bool`, `count`.
-            Not SI, as surveyors write them: `%`, `deg`, `mm`, `mm/m`, `m/100 m`, `1/100 scans`, `nat`.
-        role: `S` scored, `G` scored and a gate, `L` logged.
-        map: Map to a score.
-        evidence: Letters of H held-out, T truth, K standard, S self-consistency, C true by construction.
-        needs: Reference that it cannot do without.
-        compute: Function from a case to a value, or to samples.
-        of: Statistic of the samples.
-    """
-
-    number: int
-    category: str
-    id: str
-    definition: str
+    number: int  # Place in the order of categories and files, 1 to 199 in the suite
+    category: str  # Three letters
+    id: str  # Unique name
+    definition: str  # Definition in a sentence: the first one of its function's docstring
+    # Unit of value and thresholds. SI: `m`, `1/m`, `1/s`, `1` (a share, ratio or correlation), `bool`, `count`. Not SI,
+    # as surveyors write them: `%`, `deg`, `mm`, `mm/m`, `m/100 m`, `1/100 scans`, `nat`.
     unit: str
-    role: str
-    map: Map
-    evidence: str
-    needs: Need | None
-    compute: Callable[[Any], Any] = field(compare=False, repr=False)
-    of: Callable[[Any], float] | None = field(default=None, compare=False, repr=False)
+    role: str  # `S` scored, `G` scored and a gate, `L` logged
+    map: Map  # Map to a score
+    evidence: str  # Letters of H held-out, T truth, K standard, S self-consistency, C true by construction
+    needs: Need | None  # Reference that it cannot do without
+    compute: Callable[[Any], Any] = field(compare=False, repr=False)  # Function from a case to a value, or to samples
+    of: Callable[[Any], float] | None = field(default=None, compare=False, repr=False)  # Statistic of the samples
 
     @property
     def scored(self) -> bool:

@@ -24,22 +24,14 @@ _KEPT = ("distance", "covered", "drift", "along_final", "along_rms", "across_rms
 
 @dataclass(frozen=True)
 class BoardConfig:
-    """Settings of a board.
+    """Settings of a board."""
 
-    Attributes:
-        sets: Sets of the arena with their truth, one for each seed.
-        out: Folder for poses, `board.json`, `board.md`, `board.png` and `records.json`.
-        programs: Programs to run; by default all, the odometer included.
-        jobs: Programs run at a time.
-        limit: Time after which a program counts as failed on a recording, s.
-        run: Run what is missing; otherwise only poses that are in `out` already are scored, and no bag is needed.
-    """
-
-    out: Path
-    sets: tuple[Path, ...] = ()
-    programs: tuple[str, ...] = (WHEELS, *ARENA)
-    jobs: int = 1
-    limit: float = 1800.0
+    out: Path  # Folder for poses, `board.json`, `board.md`, `board.png` and `records.json`.
+    sets: tuple[Path, ...] = ()  # Sets of the arena with their truth, one for each seed.
+    programs: tuple[str, ...] = (WHEELS, *ARENA)  # Programs to run; by default all, the odometer included.
+    jobs: int = 1  # Programs run at a time.
+    limit: float = 1800.0  # Time after which a program counts as failed on a recording, s.
+    # Run what is missing; otherwise only poses that are in `out` already are scored, and no bag is needed.
     run: bool = True
 
 

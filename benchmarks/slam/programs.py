@@ -42,17 +42,11 @@ _CHANGES = {"max_num_threads": 1, "num_threads": 1, "ls_num_threads": 1, "number
 
 
 class Program(NamedTuple):
-    """A program that gives poses.
+    """A program that gives poses."""
 
-    Attributes:
-        package: Package that it comes with.
-        run: Runs it on the folder of a recording.
-        topic: Topic of the bag that it reads; empty where it reads recordings of the arena.
-    """
-
-    package: str
-    run: Callable[[Path], Poses]
-    topic: str = ""
+    package: str  # Package that it comes with
+    run: Callable[[Path], Poses]  # Runs it on the folder of a recording
+    topic: str = ""  # Topic of the bag that it reads; empty where it reads recordings of the arena
 
 
 def make_kiss(voxel: float | None, max_range: float) -> Step:

@@ -24,33 +24,21 @@ _WITHOUT_CLOUD = ("Obstructed", "Faulted")  # clouds show neither boxes nor faul
 
 @dataclasses.dataclass(frozen=True)
 class SetConfig:
-    """Settings of a set of recordings.
+    """Settings of a set of recordings."""
 
-    Attributes:
-        out: Folder of the set: `recordings/` to hand out, `truth/` to keep.
-        tasks: Task ids, as `StopAt`.
-        linings: Variants of the walls.
-        episodes: Number of episodes of each task, from the start of its list.
-        scene: Built scene folder; its tunnel is driven and clouds are recorded in it.
-        tunnel: Tunnel to use instead, without clouds.
-        cloud: 3-D LiDAR, if a scene is given and the task has no boxes or faults.
-        columns: Columns of its sweep.
-        beams: Beams of `/scan_dense`.
-        steps: Largest number of steps of a recording.
-        secret: Number from which episodes are drawn instead of the public list, for a test whose truth nobody else
-            can reproduce. It is kept with the truth only.
-    """
-
-    out: Path
+    out: Path  # Folder of the set: `recordings/` to hand out, `truth/` to keep.
+    # Task ids, as `StopAt`.
     tasks: tuple[str, ...] = ("Traverse", "StopAt", "Return", "Obstructed", "Faulted", "Relocalise")
-    linings: tuple[str, ...] = ("pockets",)
-    episodes: int = 3
-    scene: Path | None = None
-    tunnel: str | None = None
-    cloud: Literal["vlp16", "os1"] = "vlp16"
-    columns: int = 900
-    beams: int = 720
-    steps: int | None = None
+    linings: tuple[str, ...] = ("pockets",)  # Variants of the walls.
+    episodes: int = 3  # Number of episodes of each task, from the start of its list.
+    scene: Path | None = None  # Built scene folder; its tunnel is driven and clouds are recorded in it.
+    tunnel: str | None = None  # Tunnel to use instead, without clouds.
+    cloud: Literal["vlp16", "os1"] = "vlp16"  # 3-D LiDAR, if a scene is given and the task has no boxes or faults.
+    columns: int = 900  # Columns of its sweep.
+    beams: int = 720  # Beams of `/scan_dense`.
+    steps: int | None = None  # Largest number of steps of a recording.
+    # Number from which episodes are drawn instead of the public list, for a test whose truth nobody else can reproduce.
+    # It is kept with the truth only.
     secret: int | None = None
 
 

@@ -30,36 +30,24 @@ _SAYS = '{"poses"'  # beginning of the line in which the process reports
 
 @dataclass(frozen=True)
 class RunConfig:
-    """Settings of a run.
+    """Settings of a run."""
 
-    Attributes:
-        library: `kiss-icp`, `genz-icp`, `kiss-icp-planar`; one of `evalio-` and `kiss`, `genz`, `mad`, `ct`, `loam`,
-            `liosam`, `dlio`, `form`, or `rko-lio`, `ring-filter`, `particle-filter`, on recordings of the arena; or
-            `wheel-odometry`, which copies the robot's own odometry.
-        recordings: Set of recordings, or its `recordings/`.
-        out: Folder for poses, `NAME.tum`, and facts, `NAME.json`; what is there is kept.
-        limit: Time after which a program counts as failed on a recording, s.
-    """
-
+    # `kiss-icp`, `genz-icp`, `kiss-icp-planar`; one of `evalio-` and `kiss`, `genz`, `mad`, `ct`, `loam`, `liosam`,
+    # `dlio`, `form`, or `rko-lio`, `ring-filter`, `particle-filter`, on recordings of the arena; or `wheel-odometry`,
+    # which copies the robot's own odometry.
     library: str
-    recordings: Path
-    out: Path
-    limit: float = 3600.0
+    recordings: Path  # Set of recordings, or its `recordings/`.
+    out: Path  # Folder for poses, `NAME.tum`, and facts, `NAME.json`; what is there is kept.
+    limit: float = 3600.0  # Time after which a program counts as failed on a recording, s.
 
 
 @dataclass(frozen=True)
 class Case:
-    """One program on one recording.
+    """One program on one recording."""
 
-    Attributes:
-        program: Name of the program.
-        recording: Folder of the recording.
-        place: Folder of the poses and facts.
-    """
-
-    program: str
-    recording: Path
-    place: Path
+    program: str  # Name of the program
+    recording: Path  # Folder of the recording
+    place: Path  # Folder of the poses and facts
 
     @property
     def name(self) -> str:

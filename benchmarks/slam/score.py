@@ -83,49 +83,29 @@ AXIS_FILE = "axis.csv"
 
 @dataclasses.dataclass(frozen=True)
 class Score:
-    """Errors of one trajectory.
+    """Errors of one trajectory."""
 
-    Attributes:
-        name: Name of the recording.
-        distance: True distance driven between the first and the last scored time, m.
-        covered: Scored share of the recording's duration.
-        poses: Number of scored poses.
-        alignment: Alignment of the estimate.
-        axis: Origin of the directions.
-        along_final: Last error of the station, m; positive if the estimate lies towards larger stations.
-        along_rms: RMS error of the station, m.
-        across_rms: RMS error of the offset to the left of the axis, m.
-        up_rms: RMS error of the height over the axis, m.
-        drift: |along_final| in % of the distance; `None` without motion.
-        piece: Length of the pieces of path for the next four figures, m.
-        piece_along: RMS error of a piece's motion along the axis, as seen from its first pose, in % of its length;
-            `None` where no piece is so long.
-        piece_across: RMS error of a piece's motion to the left, in % of its length.
-        piece_turn: RMS error of a piece's turn, °/m.
-        rpe: Spread of the pieces' errors, m.
-        ape: Spread of the position errors, m.
-        ape_turn: Spread of the attitude errors, °.
-        reach: Distance driven when the error of the station first exceeds 1 m, m; `None` where it never does.
-    """
-
-    name: str
-    distance: float
-    covered: float
-    poses: int
-    alignment: str
-    axis: str
-    along_final: float
-    along_rms: float
-    across_rms: float
-    up_rms: float
-    drift: float | None
-    piece: float
+    name: str  # Name of the recording
+    distance: float  # True distance driven between the first and the last scored time, m
+    covered: float  # Scored share of the recording's duration
+    poses: int  # Number of scored poses
+    alignment: str  # Alignment of the estimate
+    axis: str  # Origin of the directions
+    along_final: float  # Last error of the station, m; positive if the estimate lies towards larger stations
+    along_rms: float  # RMS error of the station, m
+    across_rms: float  # RMS error of the offset to the left of the axis, m
+    up_rms: float  # RMS error of the height over the axis, m
+    drift: float | None  # |along_final| in % of the distance; `None` without motion
+    piece: float  # Length of the pieces of path for the next four figures, m
+    # RMS error of a piece's motion along the axis, as seen from its first pose, in % of its length; `None` where no
+    # piece is so long
     piece_along: float | None
-    piece_across: float | None
-    piece_turn: float | None
-    rpe: Spread | None
-    ape: Spread
-    ape_turn: Spread
+    piece_across: float | None  # RMS error of a piece's motion to the left, in % of its length
+    piece_turn: float | None  # RMS error of a piece's turn, °/m
+    rpe: Spread | None  # Spread of the pieces' errors, m
+    ape: Spread  # Spread of the position errors, m
+    ape_turn: Spread  # Spread of the attitude errors, °
+    # Distance driven when the error of the station first exceeds 1 m, m; `None` where it never does
     reach: float | None = None
 
 
@@ -260,23 +240,15 @@ def _pieces(track: Track, axis: Axis, piece: float) -> dict[str, Any]:
 
 @dataclasses.dataclass(frozen=True)
 class ScoreConfig:
-    """Settings of a scoring.
+    """Settings of a scoring."""
 
-    Attributes:
-        estimate: TUM files, or folders of `NAME.tum`, each folder one program.
-        truth: TUM file, or the `truth/` folder of a set.
-        axis: `axis.csv`, if it is not beside the truth.
-        alignment: `origin`: the first pose is known; `se3`: best fit; `none`: poses in the tunnel's frame.
-        piece: Length of the pieces of path for relative errors, m.
-        out: Folder for `scores.json`, `scores.md` and `scores.png`.
-    """
-
-    estimate: tuple[Path, ...]
-    truth: Path
-    axis: Path | None = None
+    estimate: tuple[Path, ...]  # TUM files, or folders of `NAME.tum`, each folder one program.
+    truth: Path  # TUM file, or the `truth/` folder of a set.
+    axis: Path | None = None  # `axis.csv`, if it is not beside the truth.
+    # `origin`: the first pose is known; `se3`: best fit; `none`: poses in the tunnel's frame.
     alignment: Alignment = "origin"
-    piece: float = 10.0
-    out: Path | None = None
+    piece: float = 10.0  # Length of the pieces of path for relative errors, m.
+    out: Path | None = None  # Folder for `scores.json`, `scores.md` and `scores.png`.
 
 
 @dataclasses.dataclass(frozen=True)

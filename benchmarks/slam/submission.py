@@ -20,15 +20,10 @@ _LEAST_WAY = 2.0  # m; a program that saw less motion has no direction
 
 @dataclass(frozen=True)
 class SubmissionConfig:
-    """Settings of a check.
+    """Settings of a check."""
 
-    Attributes:
-        submission: Folder of `NAME.tum` and `program.json`.
-        recordings: Set that the program ran on, or its `recordings/`.
-    """
-
-    submission: Path
-    recordings: Path
+    submission: Path  # Folder of `NAME.tum` and `program.json`.
+    recordings: Path  # Set that the program ran on, or its `recordings/`.
 
 
 def check_submission(config: SubmissionConfig) -> list[str]:

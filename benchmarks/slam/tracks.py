@@ -21,19 +21,12 @@ _LEAST_STRETCH = 0.2  # least length of 1 m of station at a point's offset: it h
 
 @dataclasses.dataclass(frozen=True)
 class Axis:
-    """A tunnel's axis as a polyline; it continues straight beyond its ends.
+    """A tunnel's axis as a polyline; it continues straight beyond its ends."""
 
-    Attributes:
-        station: Stations of its points, increasing, m.
-        position: Positions of its points, m.
-        frames: Unit vectors along, left and up as rows.
-        source: Origin of the axis, for the report.
-    """
-
-    station: Float[np.ndarray, " n"]
-    position: Float[np.ndarray, "n 3"]
-    frames: Float[np.ndarray, "n 3 3"]
-    source: str
+    station: Float[np.ndarray, " n"]  # Stations of its points, increasing, m
+    position: Float[np.ndarray, "n 3"]  # Positions of its points, m
+    frames: Float[np.ndarray, "n 3 3"]  # Unit vectors along, left and up as rows
+    source: str  # Origin of the axis, for the report
 
     def nearest(self, position: Float[np.ndarray, "k 3"]) -> Int[np.ndarray, " k"]:
         """Returns the index of the axis' point nearest to each position."""
@@ -115,23 +108,14 @@ _SLACK = 1e-3  # s: a stamp this far outside the truth's span still counts as it
 
 @dataclasses.dataclass(frozen=True)
 class Track:
-    """Estimated and true poses at the same times.
+    """Estimated and true poses at the same times."""
 
-    Attributes:
-        time: Times, increasing, s.
-        position: Estimated positions, m.
-        rotation: Estimated attitudes, `n` of them.
-        true_position: True positions, m.
-        true_rotation: True attitudes, `n` of them.
-        covered: Share of the truth's duration between the first and the last of these times.
-    """
-
-    time: Float[np.ndarray, " n"]
-    position: Float[np.ndarray, "n 3"]
-    rotation: Rotation
-    true_position: Float[np.ndarray, "n 3"]
-    true_rotation: Rotation
-    covered: float
+    time: Float[np.ndarray, " n"]  # Times, increasing, s
+    position: Float[np.ndarray, "n 3"]  # Estimated positions, m
+    rotation: Rotation  # Estimated attitudes, `n` of them
+    true_position: Float[np.ndarray, "n 3"]  # True positions, m
+    true_rotation: Rotation  # True attitudes, `n` of them
+    covered: float  # Share of the truth's duration between the first and the last of these times
 
     @property
     def travelled(self) -> Float[np.ndarray, " n"]:

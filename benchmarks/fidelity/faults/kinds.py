@@ -28,20 +28,13 @@ PointMap = Callable[[Points], Points]
 
 @dataclass(frozen=True)
 class Fault:
-    """One fault.
+    """One fault."""
 
-    Attributes:
-        kind: Name in `KINDS`.
-        size: Size in the unit of its kind; a sign tells the direction.
-        start: Station where it is first at full size, m; all of the tunnel where `None`.
-        length: Length at full size, m.
-        side: Angle of the part of the section that it is at, from left towards up, rad; kinds that have none ignore it.
-    """
-
-    kind: str
-    size: float = 1.0
-    start: float | None = None
-    length: float = 0.0
+    kind: str  # Name in `KINDS`
+    size: float = 1.0  # Size in the unit of its kind; a sign tells the direction
+    start: float | None = None  # Station where it is first at full size, m; all of the tunnel where `None`
+    length: float = 0.0  # Length at full size, m
+    # Angle of the part of the section that it is at, from left towards up, rad; kinds that have none ignore it
     side: float = 0.0
 
     def share(self, station: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
@@ -54,18 +47,12 @@ class Fault:
 
 @dataclass(frozen=True)
 class Site:
-    """A case to put faults into.
+    """A case to put faults into."""
 
-    Attributes:
-        case: The case as it is.
-        rng: Random numbers of the fault.
-        scratch: A folder to write a changed scene into.
-        foreign: Function that loads another tunnel of the same class; `None` where there is none.
-    """
-
-    case: Case
-    rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
-    scratch: Path = Path("scratch")
+    case: Case  # The case as it is
+    rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))  # Random numbers of the fault
+    scratch: Path = Path("scratch")  # A folder to write a changed scene into
+    # Function that loads another tunnel of the same class; `None` where there is none
     foreign: Callable[[], Candidate] | None = None
 
     @property
@@ -120,24 +107,16 @@ def _denser(points: Points, line: Curve) -> Points:
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of fault.
+    """A kind of fault."""
 
-    Attributes:
-        words: Fault in words.
-        unit: Unit of its size: `m`, `rad`, `1` (a share or factor) or `count`.
-        change: Function that carries it out; it returns the changed candidate, or the case where references change.
-        signed: True where it goes both ways.
-        sides: Angles that a random `side` is drawn from, rad.
-        doses: Sizes of a control that `controls` runs with a user's own kind; empty for none.
-        falls: Points that a category must lose at least at the largest of them.
-    """
-
-    words: str
-    unit: str
+    words: str  # Fault in words
+    unit: str  # Unit of its size: `m`, `rad`, `1` (a share or factor) or `count`
+    # Function that carries it out; it returns the changed candidate, or the case where references change
     change: Callable[[Site, Fault], Candidate | Case]
-    signed: bool = True
-    sides: tuple[float, ...] = (0.0,)
-    doses: tuple[float, ...] = ()
+    signed: bool = True  # True where it goes both ways
+    sides: tuple[float, ...] = (0.0,)  # Angles that a random `side` is drawn from, rad
+    doses: tuple[float, ...] = ()  # Sizes of a control that `controls` runs with a user's own kind; empty for none
+    # Points that a category must lose at least at the largest of them
     falls: dict[str, float] = field(default_factory=dict)
 
 

@@ -22,33 +22,20 @@ _UNITS: dict[str, Callable[[float], float]] = {"": float, "%": lambda dose: dose
 
 @dataclass(frozen=True)
 class Control:
-    """Row of the table of controls.
+    """Row of the table of controls."""
 
-    Attributes:
-        id: N01 to N36, which must be noticed, I1 to I7, which must not, or the name of a kind from outside.
-        corruption: Corruption in words.
-        faults: Faults by dose, in growing severity.
-        bold: Doses that must FAIL.
-        falls: Points that a category must lose at least at the bold dose.
-        quiet: Categories that may move by at most 2 points.
-        evaluated: Categories to compute; the others keep the base's values, since nothing they read has changed.
-        limit: Points that an invariance may move a category; `None` for a fault that must be noticed.
-        exempt: Categories that an invariance may move.
-        reason: Reason for a difference from the specification; empty where there is none.
-        kind: `negative`, `invariance`, or `outside` for one of a user's own, which decides no verdict.
-    """
-
-    id: str
-    corruption: str
-    faults: dict[float, Fault]
-    bold: tuple[float, ...]
-    falls: dict[str, float]
-    quiet: tuple[str, ...] = ()
+    id: str  # N01 to N36, which must be noticed, I1 to I7, which must not, or the name of a kind from outside
+    corruption: str  # Corruption in words
+    faults: dict[float, Fault]  # Faults by dose, in growing severity
+    bold: tuple[float, ...]  # Doses that must FAIL
+    falls: dict[str, float]  # Points that a category must lose at least at the bold dose
+    quiet: tuple[str, ...] = ()  # Categories that may move by at most 2 points
+    # Categories to compute; the others keep the base's values, since nothing they read has changed
     evaluated: str = "all"
-    limit: float | None = None
-    exempt: tuple[str, ...] = ()
-    reason: str = ""
-    kind: str = "negative"
+    limit: float | None = None  # Points that an invariance may move a category; `None` for a fault that must be noticed
+    exempt: tuple[str, ...] = ()  # Categories that an invariance may move
+    reason: str = ""  # Reason for a difference from the specification; empty where there is none
+    kind: str = "negative"  # `negative`, `invariance`, or `outside` for one of a user's own, which decides no verdict
 
 
 def load_controls() -> dict[str, Control]:

@@ -26,17 +26,11 @@ _SWEEPS = 12  # sweeps of a drive that are looked at
 
 
 class Floor(NamedTuple):
-    """Bounds of one drive.
+    """Bounds of one drive."""
 
-    Attributes:
-        sweep: Cramér–Rao bound of the station from one sweep and a perfect map, median over the drive, m.
-        view: Length of bore that a sweep shows, m.
-        drift: Floor of the axial drift per 100 m, m.
-    """
-
-    sweep: float
-    view: float
-    drift: float
+    sweep: float  # Cramér–Rao bound of the station from one sweep and a perfect map, median over the drive, m
+    view: float  # Length of bore that a sweep shows, m
+    drift: float  # Floor of the axial drift per 100 m, m
 
 
 def find_floor(scene: Scene) -> Floor:

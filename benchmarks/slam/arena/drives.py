@@ -34,17 +34,11 @@ def ramp_area(time: Float[np.ndarray, "n"], begin: float, run: float) -> Float[n
 
 @dataclass(frozen=True)
 class Tremor:
-    """Periodic motion about a mean: a sum of cosines.
+    """Periodic motion about a mean: a sum of cosines."""
 
-    Attributes:
-        amplitude: One for each cosine, m or rad.
-        rate: Its frequency, Hz.
-        phase: Its phase, rad.
-    """
-
-    amplitude: Float[np.ndarray, "k"]
-    rate: Float[np.ndarray, "k"]
-    phase: Float[np.ndarray, "k"]
+    amplitude: Float[np.ndarray, "k"]  # One for each cosine, m or rad
+    rate: Float[np.ndarray, "k"]  # Its frequency, Hz
+    phase: Float[np.ndarray, "k"]  # Its phase, rad
 
     def __call__(self, time: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
         """Returns the value at `time`, s."""
@@ -53,22 +47,15 @@ class Tremor:
 
 @dataclass(frozen=True)
 class Carrier:
-    """A way of carrying a LiDAR.
+    """A way of carrying a LiDAR."""
 
-    Attributes:
-        speed: Cruising speed, m/s.
-        height: Height of the LiDAR over the floor, m.
-        turn: Turn to the left and back during the stop, rad.
-        shake: Amplitude and frequency of the beat of steps or wheels, for each of ahead, across, up (m), yaw, pitch and
-            roll (rad); frequencies in Hz.
-        sway: Standard deviation of the slow sway, 0.05 to 0.4 Hz, of the same six.
-    """
-
-    speed: float
-    height: float
-    turn: float
+    speed: float  # Cruising speed, m/s
+    height: float  # Height of the LiDAR over the floor, m
+    turn: float  # Turn to the left and back during the stop, rad
+    # Amplitude and frequency of the beat of steps or wheels, for each of ahead, across, up (m), yaw, pitch and roll
+    # (rad); frequencies in Hz
     shake: tuple[tuple[float, float], ...]
-    sway: tuple[float, ...]
+    sway: tuple[float, ...]  # Standard deviation of the slow sway, 0.05 to 0.4 Hz, of the same six
 
 
 _DEGREE = np.pi / 180.0
@@ -98,21 +85,13 @@ CARRIERS: dict[MotionName, Carrier] = {
 
 @dataclass(frozen=True)
 class Drive:
-    """A LiDAR's way through a bore: rest, half of the way, stop, the other half, rest.
+    """A LiDAR's way through a bore: rest, half of the way, stop, the other half, rest."""
 
-    Attributes:
-        bore: Bore driven through.
-        carrier: Way of carrying.
-        begin: Station of the start, m.
-        distance: Length of the way, m.
-        tremors: Motion about the way: ahead, across, up, yaw, pitch, roll.
-    """
-
-    bore: Bore
-    carrier: Carrier
-    begin: float
-    distance: float
-    tremors: tuple[Tremor, ...]
+    bore: Bore  # Bore driven through
+    carrier: Carrier  # Way of carrying
+    begin: float  # Station of the start, m
+    distance: float  # Length of the way, m
+    tremors: tuple[Tremor, ...]  # Motion about the way: ahead, across, up, yaw, pitch, roll
 
     @property
     def knots(self) -> tuple[float, ...]:

@@ -21,17 +21,11 @@ _AT_ONCE = 40_000  # rays met with all puffs at a time
 
 @dataclass(frozen=True)
 class Dust:
-    """Spheres of dust in the LiDAR's frame.
+    """Spheres of dust in the LiDAR's frame."""
 
-    Attributes:
-        middle: Their middles, m, `(k, 3)`.
-        radius: Their radii, m, `(k,)`.
-        density: Density against that of full dust, 1.
-    """
-
-    middle: Float[np.ndarray, "k 3"]
-    radius: Float[np.ndarray, "k"]
-    density: float
+    middle: Float[np.ndarray, "k 3"]  # Their middles, m, `(k, 3)`
+    radius: Float[np.ndarray, "k"]  # Their radii, m, `(k,)`
+    density: float  # Density against that of full dust, 1
 
     def __call__(self, rng: np.random.Generator, ray: Float[np.ndarray, "n 3"], hits: Hits) -> Hits:
         """Returns what rays in the LiDAR's frame hit with the dust before the walls: a `Veil` of `scene.survey`."""

@@ -34,25 +34,15 @@ _TRUTH_RATE, _AXIS_STEP = 200.0, 0.25  # Hz; m
 
 @dataclass(frozen=True)
 class Sensor:
-    """A LiDAR as its driver publishes it.
+    """A LiDAR as its driver publishes it."""
 
-    Attributes:
-        lidar: Model.
-        topic: Topic of its sweeps.
-        frame: Frame of its points.
-        kind: Type of its messages.
-        encode: A sweep as one of them.
-        beams: Lines.
-        ahead: Bore that it may see before the end of the drive, m.
-    """
-
-    lidar: Lidar
-    topic: str
-    frame: str
-    kind: str
-    encode: Callable[[Sweep, Lidar], bytes]
-    beams: int
-    ahead: float = _AHEAD
+    lidar: Lidar  # Model
+    topic: str  # Topic of its sweeps
+    frame: str  # Frame of its points
+    kind: str  # Type of its messages
+    encode: Callable[[Sweep, Lidar], bytes]  # A sweep as one of them
+    beams: int  # Lines
+    ahead: float = _AHEAD  # Bore that it may see before the end of the drive, m
 
 
 def make_sensor(name: SensorName) -> Sensor:
@@ -73,23 +63,14 @@ def make_sensor(name: SensorName) -> Sensor:
 
 @dataclass(frozen=True)
 class Course:
-    """One recording of the arena: what is driven through, how, and with which sensor.
+    """One recording of the arena: what is driven through, how, and with which sensor."""
 
-    Attributes:
-        name: Name of the recording.
-        walls: Position on the dial.
-        sensor: LiDAR.
-        motion: Way of carrying it.
-        dust: Density of the dust that moves with it; 0 is none, 1 full.
-        distance: Length of the way, m.
-    """
-
-    name: str
-    walls: WallName
-    sensor: SensorName = "vlp16"
-    motion: MotionName = "trolley"
-    dust: float = 0.0
-    distance: float = 60.0
+    name: str  # Name of the recording
+    walls: WallName  # Position on the dial
+    sensor: SensorName = "vlp16"  # LiDAR
+    motion: MotionName = "trolley"  # Way of carrying it
+    dust: float = 0.0  # Density of the dust that moves with it; 0 is none, 1 full
+    distance: float = 60.0  # Length of the way, m
 
 
 @dataclass(frozen=True)

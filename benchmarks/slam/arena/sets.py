@@ -33,26 +33,17 @@ COURSES: tuple[Course, ...] = (*_DIAL, *_SENSORS, *_DUST, *_MOTIONS)
 
 @dataclass(frozen=True)
 class ArenaConfig:
-    """Settings of a set.
+    """Settings of a set."""
 
-    Attributes:
-        out: Folder of the set: `recordings/` to hand out, `truth/` to keep.
-        courses: Names of the recordings, as `walls-smooth`; by default all.
-        formats: `mcap` for ROS 2, `bag` for ROS 1.
-        distance: Length of each drive, m.
-        seed: Draws walls, drives and noise.
-        secret: Number from which they are drawn instead, so that nobody else can make the truth. It is kept with the
-            truth only.
-        jobs: Recordings made at a time.
-    """
-
-    out: Path
+    out: Path  # Folder of the set: `recordings/` to hand out, `truth/` to keep.
+    # Names of the recordings, as `walls-smooth`; by default all.
     courses: tuple[str, ...] = tuple(one.name for one in COURSES)
-    formats: tuple[FormatName, ...] = ("mcap",)
-    distance: float = 45.0
-    seed: int = 0
+    formats: tuple[FormatName, ...] = ("mcap",)  # `mcap` for ROS 2, `bag` for ROS 1.
+    distance: float = 45.0  # Length of each drive, m.
+    seed: int = 0  # Draws walls, drives and noise.
+    # Number from which they are drawn instead, so that nobody else can make the truth. It is kept with the truth only.
     secret: int | None = None
-    jobs: int = 1
+    jobs: int = 1  # Recordings made at a time.
 
 
 def plan_arena(config: ArenaConfig) -> list[Course]:
