@@ -248,7 +248,6 @@ def run_split(config: SplitCommand) -> None:
 
 
 def _write_report(opened: OpenCase) -> dict[str, Any]:
-    """Writes the report over all results for this case in `--out`."""
     inputs, folder = opened.inputs, opened.inputs.out
     key = case_hash(opened.case)
     swept = read_kept(folder / "sweep.json", SWEEP_SCHEMA, key) or None

@@ -34,7 +34,6 @@ class Geoms:
 
     @classmethod
     def of(cls, model: mujoco.MjModel) -> "Geoms":
-        """Return the geoms of a model."""
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
         return cls(model, data, tuple(model.geom(geom).name for geom in range(model.ngeom)))

@@ -53,7 +53,6 @@ def number(value: float, n: int = 0, reason: str = "") -> Value:
 
 
 def pass_or_fail(condition: bool, reason: str = "") -> Value:
-    """Return 1 or 0."""
     return Value(float(bool(condition)), None, 1, reason)
 
 

@@ -51,7 +51,6 @@ class Scored:
 
     @property
     def evaluated(self) -> int:
-        """Number of categories with a score."""
         return sum(score is not None for score in self.categories.values())
 
     @property

@@ -103,7 +103,6 @@ class Metric:
 
     @property
     def scored(self) -> bool:
-        """True where the metric counts in its category."""
         return self.role in "SG"
 
     @property
@@ -195,7 +194,6 @@ def load_all() -> dict[str, Metric]:
 
 
 def forget(ids: set[str]) -> None:
-    """Forgets metrics from outside."""
     for id in ids - set(_suite()):
         _METRICS.pop(id, None)
     _order[:] = [id for id in _order if id in _METRICS]

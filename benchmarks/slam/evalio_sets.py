@@ -48,14 +48,12 @@ class SubterraSet(Dataset):
 
     @property
     def folder(self) -> Path:
-        """Folder of the recording."""
         return set_folder() / "recordings" / self.value
 
     def _calibration(self) -> dict[str, Any]:
         return yaml.safe_load((self.folder / "calibration.yaml").read_text())
 
     def data_iter(self) -> RosbagIter:
-        """Returns an iterator over sweeps and IMU samples."""
         facts = self._calibration()
         organised = facts["lidar"]["model"].startswith("os1")
         layout = LidarFormatParams(
@@ -69,14 +67,12 @@ class SubterraSet(Dataset):
         return _LivoxIter(bag, *topics, self.lidar_params(), lidar_format=layout, custom_col_func=_columns(facts))
 
     def ground_truth_raw(self) -> Trajectory | None:
-        """Returns the poses of the LiDAR, where the truth is at hand."""
         path = set_folder() / "truth" / self.value / "lidar.tum"
         if not path.is_file():
             return None
         return Trajectory.from_csv(path, ["sec", "x", "y", "z", "qx", "qy", "qz", "qw"], delimiter=" ")
 
     def imu_T_lidar(self) -> SE3:
-        """Returns the pose of the LiDAR in the IMU's frame."""
         return SE3(SO3.identity(), np.array(self._calibration()["imu"]["shift_from_lidar"]))
 
     def imu_T_gt(self) -> SE3:
@@ -84,7 +80,6 @@ class SubterraSet(Dataset):
         return self.imu_T_lidar()
 
     def imu_params(self) -> ImuParams:
-        """Returns noise and rate of the IMU."""
         imu = self._calibration()["imu"]
         return ImuParams(
             gyro=imu["gyro_noise_density"], accel=imu["accel_noise_density"], gyro_bias=imu["gyro_random_walk"],
@@ -93,7 +88,6 @@ class SubterraSet(Dataset):
         )  # fmt: skip
 
     def lidar_params(self) -> LidarParams:
-        """Returns lines, columns and ranges of the LiDAR."""
         lidar = self._calibration()["lidar"]
         return LidarParams(
             num_rows=lidar["rows"], num_columns=lidar["columns"], min_range=lidar["range_min"],
@@ -101,16 +95,13 @@ class SubterraSet(Dataset):
         )  # fmt: skip
 
     def files(self) -> Sequence[str | Path]:
-        """Returns the files that must be there."""
         return [self.folder / "calibration.yaml", self.folder / "recording" / "metadata.yaml"]
 
     @classmethod
     def dataset_name(cls) -> str:
-        """Returns the name before the slash."""
         return "subterra"
 
     def environment(self) -> str:
-        """Returns a word on the place."""
         return "Tunnel, simulated"
 
 
@@ -141,7 +132,6 @@ class _LivoxIter(RosbagIter):
         return scan
 
     def __iter__(self) -> Any:
-        """Yields IMU samples and sweeps in order of recording."""
         for connection, _, raw in self.reader.messages(connections=self.connections_lidar + self.connections_imu):
             if connection.msgtype.endswith("CustomMsg"):
                 yield self._convert_livox(raw)
@@ -151,7 +141,6 @@ class _LivoxIter(RosbagIter):
             yield self._imu_conversion(message) if imu else self._lidar_conversion(message)
 
     def lidar_iter(self) -> Any:
-        """Yields the sweeps."""
         return (one for one in self if not isinstance(one, ImuMeasurement))
 
 

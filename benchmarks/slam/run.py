@@ -51,7 +51,6 @@ class Case:
 
     @property
     def name(self) -> str:
-        """Name of the recording."""
         return self.recording.name
 
     @property

@@ -25,7 +25,6 @@ class Spread:
 
     @classmethod
     def of(cls, errors: Float[np.ndarray, " n"]) -> "Spread":
-        """Returns the statistics of at least one error."""
         rmse = float(np.sqrt(np.mean(errors**2)))
         rest = (np.mean(errors), np.median(errors), np.std(errors), np.min(errors), np.max(errors))
         return cls(rmse, *(float(value) for value in rest))
@@ -272,7 +271,6 @@ def score_all(config: ScoreConfig) -> list[ProgramScore]:
 
 
 def _score_path(path: Path, config: ScoreConfig) -> list[ProgramScore]:
-    """Scores a TUM file, or every TUM file of a folder."""
     if not path.exists():
         raise BenchmarkError(f"{path}: no such file or folder")
     pairs = _pairs(path, config.truth) if path.is_dir() else [(path, _find_truth(path, config.truth))]

@@ -29,7 +29,6 @@ class Axis:
     source: str  # Origin of the axis, for the report
 
     def nearest(self, position: Float[np.ndarray, "k 3"]) -> Int[np.ndarray, " k"]:
-        """Returns the index of the axis' point nearest to each position."""
         return cKDTree(self.position).query(position)[1]
 
     def coordinates(self, position: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3"]:

@@ -156,7 +156,6 @@ class AxisPair:
 
 @per_case
 def axis_pair(case: Case) -> AxisPair:
-    """Return lining axis and reference axis where both exist."""
     reference, axis = reference_curve(case), lining_curve(case)
     fine = axis.frames(np.linspace(0.0, axis.length, int(axis.length / 0.25) + 2))[0]
     local = reference.local(fine)

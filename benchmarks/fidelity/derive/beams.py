@@ -86,7 +86,6 @@ class CastBeams:
 
     @property
     def hit(self) -> Bool[np.ndarray, " n"]:
-        """True where the beam meets the candidate, `(n,)`."""
         return self.face >= 0
 
 
@@ -227,7 +226,6 @@ class BeamDirections:
 
 @per_hold
 def beam_directions(case: Case) -> BeamDirections:
-    """Return azimuth and elevation of the held-out beams with a return."""
     real, path = returns(case), sensor_path(case)
     _, starts = np.unique(real.scan, return_index=True)
     tangent, left, up = path.frames(path.local(real.origin[starts])[:, 0])[1:]

@@ -81,7 +81,6 @@ def real_planes(case: Case) -> Planes:
 
 @kept_until("DIS", per_case)
 def synthetic_tree(case: Case) -> tuple[Float[np.ndarray, "m 3"], cKDTree]:
-    """Return the finite synthetic points and their tree."""
     points = synthetic_points(case)
     points = points[np.isfinite(points[:, 0])]
     if len(points) < NEIGHBOURS:
@@ -255,7 +254,6 @@ class Patches:
 
     @property
     def planes(self) -> int:
-        """Number of planes."""
         return len(self.beam)
 
 

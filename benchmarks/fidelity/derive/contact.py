@@ -174,7 +174,6 @@ def stepper(case: Case) -> Stepper:
 
 @per_release("scene")
 def step_is_finite(case: Case) -> bool:
-    """Return True where one step from the first pose gives finite numbers."""
     compiled = stepper(case)
     after = compiled.step(compiled.data)
     return bool(np.isfinite(np.asarray(after.qpos)).all() and np.isfinite(np.asarray(after.qvel)).all())

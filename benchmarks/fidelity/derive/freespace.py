@@ -128,7 +128,6 @@ def make_lattice(case: Case, edge: float) -> Lattice:
 
 @kept_until("F3D", per_case)
 def air_voxels(case: Case) -> Air:
-    """Return the air of candidate and reference in voxels."""
     cells = air_lattice(case)
     inside = (lining_radii(case).depth(cells.points()) > 0).reshape(cells.shape)
     track = cells.marked(cells.curve.local(track_points(case, cells.edge)))

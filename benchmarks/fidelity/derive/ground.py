@@ -224,7 +224,6 @@ def _reference_ground(case: Case) -> Ground:
 
 
 def _ground_of_points(curve: Curve, cell: float, local: Float[np.ndarray, "k 3"]) -> Ground:
-    """Return the ground of returns, about a curve, lattice by lattice."""
     station, left = ground_axes(curve, cell)
     low = local[local[:, 2] < _FLOOR_BELOW]
     height, step = np.empty((len(station), len(left))), np.empty((len(station), len(left)))
@@ -310,13 +309,11 @@ def _nearest_to_axis(ground: Ground, fits: Bool[np.ndarray, "n m"], end: int) ->
 
 @per_case
 def judged_route(case: Case) -> Route | None:
-    """Return the route on the candidate's own ground."""
     return find_route(judged_ground(case))
 
 
 @per_case
 def both_routes(case: Case) -> tuple[Route | None, Route | None]:
-    """Return the routes on the two grounds that are compared."""
     return find_route(both_grounds(case)[0]), _reference_route(case)
 
 

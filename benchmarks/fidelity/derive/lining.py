@@ -299,7 +299,6 @@ def detect_pockets(
 
 
 def shown_pockets(unrolled: Unrolled, arc: Float[np.ndarray, " m"]) -> Pockets:
-    """Return the pockets that beams show."""
     return detect_pockets(unrolled, blur(unrolled.depth, np.isfinite(unrolled.depth)), arc, GRAZED_POCKET)
 
 

@@ -46,7 +46,6 @@ def is_sound(mesh: trimesh.Trimesh) -> bool:
 
 
 def mesh_edges(mesh: trimesh.Trimesh) -> Edges:
-    """Return the edges of a welded mesh."""
     ends, count = np.unique(mesh.edges_sorted, axis=0, return_counts=True)
     return Edges(ends, count, np.linalg.norm(mesh.vertices[ends[:, 0]] - mesh.vertices[ends[:, 1]], axis=1))
 

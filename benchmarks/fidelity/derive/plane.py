@@ -55,7 +55,6 @@ def sensor_height(case: Case) -> float:
 
 @per_case
 def free_plane(case: Case) -> Plane:
-    """Return the free cells of candidate and reference."""
     around, height = make_lattice(case, PLANE_CELL * case.tolerance), sensor_height(case)
     low = np.array([around.low[0], around.low[1], height - around.edge / 2])
     cells = Lattice(around.curve, low, (around.shape[0], around.shape[1], 1), around.edge)

@@ -68,7 +68,6 @@ _HASHES = {"scene": scene_hash, "tunnel": tunnel_hash, "mesh": mesh_hash}
 
 
 def asset_files(scene: Path) -> list[Path]:
-    """Return the paths of the files that an MJCF names."""
     root = ElementTree.parse(scene).getroot()
     compiler = root.find("compiler")
     where = compiler.attrib if compiler is not None else {}
@@ -220,7 +219,6 @@ class Pieces:
 
 
 def fastening_pieces(mesh: trimesh.Trimesh) -> Pieces:
-    """Return pads and clips one by one."""
     if not len(mesh.faces):
         return Pieces(np.zeros((0, 3)), np.zeros(0))
     part = face_parts(mesh)

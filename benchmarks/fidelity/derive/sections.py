@@ -209,7 +209,6 @@ def _close_holes(radius: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n m"]:
 
 @per_case
 def lining_radii(case: Case) -> Radii:
-    """Return the radii of the candidate's lining from its own axis."""
     return cast_radii(lining_curve(case), lining_caster(case))
 
 
@@ -220,6 +219,5 @@ def truth_radii(case: Case) -> Radii:
 
 @kept_until("NAV", per_truth)
 def truth_caster(case: Case) -> Caster:
-    """Return the caster of rays into all of the true surface."""
     assert case.truth is not None
     return Caster(case.truth.surface)

@@ -159,19 +159,16 @@ def visible_bodies(candidate: Candidate) -> dict[str, trimesh.Trimesh]:
 
 @kept_until("NAV", per_case)
 def visible_surface(case: Case) -> trimesh.Trimesh:
-    """Return everything visible of the candidate, tunnel frame."""
     return visible_mesh(case.candidate)
 
 
 @kept_until("NAV", per_case)
 def surface_caster(case: Case) -> Caster:
-    """Return the caster of rays into `visible_surface`."""
     return Caster(visible_surface(case))
 
 
 @kept_until("BEA", per_case)  # F3D and SCN make it anew: 0.2 GiB of 351 m
 def surface_nearest(case: Case) -> Nearest:
-    """Return the distances to `visible_surface`."""
     return Nearest(visible_surface(case))
 
 

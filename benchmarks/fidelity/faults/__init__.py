@@ -14,5 +14,4 @@ _SUITE = frozenset(KINDS)
 
 
 def outside_kinds() -> dict[str, Kind]:
-    """Return the kinds that are not the suite's own."""
     return {name: kind for name, kind in KINDS.items() if name not in _SUITE}

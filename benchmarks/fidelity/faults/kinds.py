@@ -57,12 +57,10 @@ class Site:
 
     @property
     def candidate(self) -> Candidate:
-        """The candidate as it is."""
         return self.case.candidate
 
     @cached_property
     def line(self) -> Curve:
-        """Axis of the candidate."""
         return Curve(self.candidate.bore.station, self.candidate.bore.position)
 
     def moved(self, shift: Callable[[Points], Points], parts: tuple[str, ...] = EVERYTHING) -> Candidate:
@@ -186,7 +184,6 @@ def warp(candidate: Candidate, move: PointMap, parts: tuple[str, ...] = EVERYTHI
 
 
 def warp_mesh(mesh: trimesh.Trimesh, move: PointMap) -> trimesh.Trimesh:
-    """Moves the vertices of a mesh."""
     if not len(mesh.faces):
         return mesh
     return trimesh.Trimesh(move(np.asarray(mesh.vertices, float)), mesh.faces, process=False)

@@ -19,7 +19,6 @@ _SLIVER = 1e-4
 
 
 def change_both(candidate: Candidate, change: Callable[[trimesh.Trimesh], trimesh.Trimesh]) -> Candidate:
-    """Changes lining and solid alike."""
     return replace(candidate, lining=change(candidate.lining), solid=change(candidate.solid))
 
 
@@ -49,8 +48,6 @@ def cut_hole(site: Site, fault: Fault) -> Candidate:
 
 @fault_kind("flipped", "share of the faces wound the wrong way", signed=False)
 def flip_faces(site: Site, fault: Fault) -> Candidate:
-    """Winds faces the wrong way; 1 flips all."""
-
     def wrong(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
         turned = site.rng.random(len(mesh.faces)) < fault.size
         return trimesh.Trimesh(mesh.vertices, np.where(turned[:, None], mesh.faces[:, ::-1], mesh.faces), process=False)
@@ -60,8 +57,6 @@ def flip_faces(site: Site, fault: Fault) -> Candidate:
 
 @fault_kind("doubled", "share of the faces that stand twice, with as many slivers", signed=False)
 def double_faces(site: Site, fault: Fault) -> Candidate:
-    """Repeats faces, and adds as many slivers along edges."""
-
     def worse(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
         pick = site.rng.permutation(len(mesh.faces))[: max(int(fault.size * len(mesh.faces)), 1)]
         corner = mesh.triangles[pick]
@@ -139,7 +134,6 @@ _PILLAR_SIZE = (0.5, 0.4)  # m along and across the tunnel
 
 
 def place_box(site: Site, station: float, left: float, up: float, size: tuple[float, float, float]) -> trimesh.Trimesh:
-    """Return a box in the frame of the axis, m."""
     position, tangent, side, top = site.line.frames(np.array([station]))
     placement = np.eye(4)
     placement[:3, :3] = np.column_stack([tangent[0], side[0], top[0]])

@@ -158,7 +158,6 @@ def subdivide(site: Site, fault: Fault) -> Candidate:
 
 @fault_kind("elsewhere", "everything 1 km away and turned by 30 degrees", signed=False)
 def move_together(site: Site, fault: Fault) -> Case:
-    """Turns and shifts reconstruction and references alike."""
     turn, bore = Rotation.from_euler("z", YAW).as_matrix(), site.candidate.bore
     moved = warp(site.candidate, lambda points: points @ turn.T + SHIFT)
     turned = {name: getattr(bore, name) @ turn.T for name in ("tangent", "lateral", "up")}
@@ -189,8 +188,6 @@ def reverse_axis(site: Site, fault: Fault) -> Candidate:
 
 @fault_kind("exchanged", "meshes through OBJ and STL", signed=False)
 def exchange_formats(site: Site, fault: Fault) -> Candidate:
-    """Writes meshes as OBJ and as binary STL and reads them again."""
-
     def exchanged(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
         for kind in ("obj", "stl"):
             data = mesh.export(file_type=kind)
@@ -204,7 +201,6 @@ def exchange_formats(site: Site, fault: Fault) -> Candidate:
 
 
 def _with_beams(case: Case, rows: Callable[[Hold], np.ndarray]) -> Case:
-    """Return the case with some beams of its recording."""
     if case.hold is None:
         return case
     names, kept = ("time", "scan", "origin", "direction", "range"), rows(case.hold)

@@ -50,7 +50,6 @@ def load_controls() -> dict[str, Control]:
 
 @cache
 def suite_controls() -> dict[str, Control]:
-    """Return the controls of the suite by id."""
     with TABLE.open(newline="") as file:
         return {row["id"]: _read_control(row) for row in csv.DictReader(file)}
 

@@ -45,7 +45,6 @@ class Job:
 
     @property
     def name(self) -> str:
-        """Name for files."""
         return f"{self.control}-{self.dose:g}"
 
 
@@ -89,7 +88,6 @@ class Bench:
 
     @cached_property
     def own(self) -> str:
-        """Hash of the base case."""
         return case_hash(self.case)
 
     def kept(self) -> list[Outcome]:
@@ -129,7 +127,6 @@ def run_jobs(bench: Bench, jobs: list[Job], processes: int = 2) -> list[Outcome]
 
 
 def run_control(bench: Bench, job: Job) -> Outcome:
-    """Computes one control at one dose."""
     rng = np.random.default_rng(np.random.SeedSequence(bench.case.seed, spawn_key=tuple(job.control.encode())))
     control = load_controls()[job.control]
     with tempfile.TemporaryDirectory() as scratch:

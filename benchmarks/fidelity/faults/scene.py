@@ -71,7 +71,6 @@ def scale_scene(candidate: Candidate, factor: float, scratch: Path) -> Candidate
 
 
 def drop_scene_faces(candidate: Candidate, share: float, rng: np.random.Generator, scratch: Path) -> Candidate:
-    """Removes random faces of the drawn lining in the compiled scene."""
     copy = copy_scene(candidate, scratch, lambda file: file.name.startswith("lining_"))
     for file in sorted((candidate.folder / "meshes").glob("lining_*.obj")):
         mesh = trimesh.load_mesh(file, process=False)

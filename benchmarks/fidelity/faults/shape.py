@@ -85,8 +85,6 @@ def move_along(site: Site, fault: Fault) -> Candidate:
 
 @fault_kind("roll", "section turned about its axis", "rad")
 def roll(site: Site, fault: Fault) -> Candidate:
-    """Turns sections about the axis, from left towards up."""
-
     def turned(local: Points) -> Points:
         turn = fault.size * fault.share(local[:, 0])
         left = local[:, 1] * np.cos(turn) - local[:, 2] * np.sin(turn)
@@ -140,7 +138,6 @@ def scale_all(site: Site, fault: Fault) -> Candidate:
 
 @fault_kind("yaw", "everything turned about the vertical through its middle", "rad")
 def turn_yaw(site: Site, fault: Fault) -> Candidate:
-    """Turns everything about the vertical through the middle of the axis."""
     middle, (c, s) = site.candidate.bore.position.mean(axis=0), (np.cos(fault.size), np.sin(fault.size))
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     return warp(site.candidate, lambda points: middle + (points - middle) @ turn.T)
@@ -174,7 +171,6 @@ def stretch_axis(site: Site, fault: Fault) -> Case:
 
 @fault_kind("short", "last part missing, as a share of the length", signed=False)
 def shorten(site: Site, fault: Fault) -> Candidate:
-    """Cuts off the last part."""
     candidate, line = site.candidate, site.line
     bore, track, end = candidate.bore, candidate.track, candidate.length * (1.0 - fault.size)
     position, tangent, *_ = line.frames(np.array([end]))

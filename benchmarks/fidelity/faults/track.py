@@ -22,7 +22,6 @@ _PITCH = 1.5  # m between joints where none is known
 
 @fault_kind("gauge", "gauge too wide or too narrow", "m")
 def spread_rails(site: Site, fault: Fault) -> Candidate:
-    """Moves rails and fastenings apart, half on each side."""
     tops = [site.line.local(top)[:, 1].mean() for top in site.candidate.track.rail.values() if len(top)]
     middle = float(np.mean(tops))
 

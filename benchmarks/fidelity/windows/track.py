@@ -43,7 +43,6 @@ NOTHING = Profile(np.empty(0), np.empty(0))
 
 
 def has_rails(case: Case) -> bool:
-    """Return True where the candidate has two rails."""
     return bool(min(len(top) for top in case.candidate.track.rail.values()) >= 2)
 
 

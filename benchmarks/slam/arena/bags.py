@@ -133,8 +133,6 @@ def _lz4(path: Path) -> rosbag1.Writer:
 
 
 class _Bag1:
-    """A ROS 1 bag."""
-
     def __init__(self, writer: rosbag1.Writer) -> None:
         self._writer = writer
         self._topics: dict[str, Any] = {}
@@ -161,8 +159,6 @@ def custom_cdr(raw: bytes) -> bytes:
 
 
 class _Bag2:
-    """A ROS 2 bag."""
-
     def __init__(self, writer: rosbag2.Writer) -> None:
         self._writer = writer
         self._topics: dict[str, Any] = {}

@@ -106,7 +106,6 @@ class Drive:
         return float(SCAN_PERIOD * np.ceil((self.knots[-1] + _RAMP + _END) / SCAN_PERIOD))
 
     def station(self, time: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-        """Returns the station of the LiDAR on its way, m."""
         signs = (1.0, -1.0, 1.0, -1.0)
         areas = (sign * ramp_area(time, at, _RAMP) for sign, at in zip(signs, self.knots, strict=True))
         return self.begin + self.carrier.speed * sum(areas, np.zeros_like(time)) + self._tremor(0, time)
@@ -121,7 +120,6 @@ class Drive:
         return self._moves(time) * self.tremors[part](time)
 
     def poses(self, time: Float[np.ndarray, "n"]) -> Poses:
-        """Returns the exact poses of the LiDAR at `time`, s."""
         station = self.station(time)
         frames = self.bore.alignment.frames(station)
         above = self.carrier.height - 0.5 * self.bore.section.height(station) + self._tremor(2, time)
