@@ -7,31 +7,8 @@ import shapely
 from scipy.spatial.transform import Rotation
 
 from benchmarks.fidelity.case import Case
-from benchmarks.fidelity.derive.axis import (
-    axis_pair,
-    chord_heading,
-    drift_slope,
-    lining_curve,
-    lining_mouths,
-    longitudinal_slope,
-    plan_curvature,
-    registration,
-)
+from benchmarks.fidelity.derive import axis, lining
 from benchmarks.fidelity.derive.curve import interpolate_rows, truth_curve
-from benchmarks.fidelity.derive.lining import (
-    PHASE_PITCHES,
-    RING_BAND,
-    both_maps,
-    judged_pockets,
-    matched_pockets,
-    paired_depths,
-    pocket_rows,
-    reference_arc,
-    reference_pitch,
-    reference_pockets,
-    ring_phases,
-    ring_pitch,
-)
 from benchmarks.fidelity.derive.sections import dimensions, sections, variation
 from benchmarks.fidelity.registry import (
     Samples,
@@ -63,20 +40,20 @@ _SAME_ROW = 0.05  # rad
 @metric("cl_lateral_rmse", "CEN", D(0.00588, 0.099), "m", gate=True, needs="reference", of=rms)
 def cl_lateral_rmse(case: Case) -> Samples:
     """Root mean square of the horizontal offset, m."""
-    return Samples(axis_pair(case).left, axis_pair(case).station)
+    return Samples(axis.axis_pair(case).left, axis.axis_pair(case).station)
 
 
 @metric("cl_lateral_p95", "CEN", D(0.0113, 0.4), "m", needs="reference", of=percentile(95))
 def cl_lateral_p95(case: Case) -> Samples:
     """95th percentile of the horizontal offset, m."""
-    both = axis_pair(case)
+    both = axis.axis_pair(case)
     return Samples(np.abs(both.left), both.station)
 
 
 @metric("cl_vertical_rmse", "CEN", D(0.00529, 0.2), "m", needs="reference", of=rms)
 def cl_vertical_rmse(case: Case) -> Samples:
     """Root mean square of the vertical offset, m."""
-    both = axis_pair(case)
+    both = axis.axis_pair(case)
     return Samples(both.judged[:, 2] - both.reference[:, 2], both.station)
 
 
@@ -84,31 +61,33 @@ def cl_vertical_rmse(case: Case) -> Samples:
 def cl_length_rel_err(case: Case) -> Value:
     """Error of the arc length from mouth to mouth, %."""
     true = truth_curve(case).length
-    return number(100.0 * abs(lining_curve(case).length - true) / true, 1)
+    return number(100.0 * abs(axis.lining_curve(case).length - true) / true, 1)
 
 
 @metric("cl_end_station_err", "CEN", D(6.17e-06, 3), "m", needs="truth")
 def cl_end_station_err(case: Case) -> Value:
     """Larger axial error of the two mouths, m."""
     curve = truth_curve(case)
-    low, high = lining_mouths(case)
+    low, high = axis.lining_mouths(case)
     return number(max(abs(low - curve.station[0]), abs(high - curve.station[-1])), 2)
 
 
 @metric("cl_heading_rmse", "CEN", D(0.212, 3), "deg", needs="reference", of=rms)
 def cl_heading_rmse(case: Case) -> Samples:
     """Root mean square of the heading error on a base of 2 m, degrees."""
-    both = axis_pair(case)
-    gap = chord_heading(both.judged) - chord_heading(both.reference)
+    both = axis.axis_pair(case)
+    gap = axis.chord_heading(both.judged) - axis.chord_heading(both.reference)
     gap = np.rad2deg((gap + np.pi) % (2 * np.pi) - np.pi)
     return Samples(gap, both.station[1:-1])
 
 
-@metric("cl_curvature_rmse", "CEN", D(0.000805, 0.005), "1/m", needs="reference", of=rms, args=(plan_curvature, 1.0))
-@metric("cl_grade_rmse", "CEN", D(0.144, 2), "%", needs="reference", of=rms, args=(longitudinal_slope, 100.0))
+@metric(
+    "cl_curvature_rmse", "CEN", D(0.000805, 0.005), "1/m", needs="reference", of=rms, args=(axis.plan_curvature, 1.0)
+)
+@metric("cl_grade_rmse", "CEN", D(0.144, 2), "%", needs="reference", of=rms, args=(axis.longitudinal_slope, 100.0))
 def axis_shape_error(case: Case, quantity: Callable[[np.ndarray], np.ndarray], factor: float) -> Samples:
     """Root mean square error of curvature (1/m) or longitudinal slope (%), each over 10 m."""
-    both = axis_pair(case)
+    both = axis.axis_pair(case)
     difference = quantity(both.judged) - quantity(both.reference)
     trim = (len(both.station) - len(difference)) // 2
     return Samples(factor * difference, both.station[trim : len(both.station) - trim])
@@ -127,20 +106,20 @@ def cl_axial_drift_slope(case: Case) -> Value:
     for points, true in pairs:
         if min(len(points), len(true)) >= _FEWEST_FEATURES:
             judged = np.sort(curve.local(points)[:, 0])
-            return number(100.0 * abs(drift_slope(judged, true)), len(judged))
+            return number(100.0 * abs(axis.drift_slope(judged, true)), len(judged))
     return missing("neither ring joints nor sleepers to follow along the tunnel")
 
 
 @metric("cl_icp_rotation", "CEN", D(0.0416, 1.5), "deg", needs="hold")
 def cl_icp_rotation(case: Case) -> Value:
     """Angle of the best rigid motion onto the held-out cloud, degrees; the motion is not applied."""
-    return number(np.rad2deg(Rotation.from_matrix(registration(case)[:3, :3]).magnitude()), 1)
+    return number(np.rad2deg(Rotation.from_matrix(axis.registration(case)[:3, :3]).magnitude()), 1)
 
 
 @metric("cl_icp_translation", "CEN", unit="m", needs="hold")
 def cl_icp_translation(case: Case) -> Value:
     """Shift of that motion at the middle of the cloud, m."""
-    return number(float(np.linalg.norm(registration(case)[:3, 3])), 1)
+    return number(float(np.linalg.norm(axis.registration(case)[:3, 3])), 1)
 
 
 # SEC: size and shape of the sections, every metre, pockets left out.
@@ -224,7 +203,7 @@ def sec_variation_ratio(case: Case) -> Value:
 @metric("lin_depth_map_ncc", "LIN", U(0.15, 0.7), gate=True, needs="hold")
 def lin_depth_map_ncc(case: Case) -> Value:
     """Correlation of the unrolled depths with those of the held-out recording, smooth section removed."""
-    station, judged, hold = paired_depths(case)
+    station, judged, hold = lining.paired_depths(case)
     if judged.std() < 1e-4:
         return number(0.0, len(judged), "the lining is smooth")
 
@@ -238,16 +217,16 @@ def lin_depth_map_ncc(case: Case) -> Value:
 @metric("lin_pocket_f1", "LIN", U(0.3, 0.99715), gate=True, needs="reference")
 def lin_pocket_f1(case: Case) -> Value:
     """F1 of the pockets, matched within 15 cm on the unrolled wall."""
-    judged, reference = judged_pockets(case), reference_pockets(case)
+    judged, reference = lining.judged_pockets(case), lining.reference_pockets(case)
     if not len(reference):
         return missing(_NO_POCKETS)
-    return number(2.0 * len(matched_pockets(case)) / (len(judged) + len(reference)), len(reference))
+    return number(2.0 * len(lining.matched_pockets(case)) / (len(judged) + len(reference)), len(reference))
 
 
 @metric("lin_pocket_count_rel_err", "LIN", D(0.567, 40), "%", needs="reference")
 def lin_pocket_count_rel_err(case: Case) -> Value:
     """Relative error of the number of pockets, %."""
-    judged, reference = judged_pockets(case), reference_pockets(case)
+    judged, reference = lining.judged_pockets(case), lining.reference_pockets(case)
     if not len(reference):
         return missing(_NO_POCKETS)
     return number(100.0 * abs(len(judged) / len(reference) - 1.0), len(reference))
@@ -263,12 +242,12 @@ def _median_absolute(errors: np.ndarray) -> float:
 @metric("lin_pocket_area_rel_err", "LIN", D(12.2, 60), "%", needs="reference", of=_median_absolute, args=("area",))
 def matched_pocket_error(case: Case, name: str) -> Value | Samples:
     """Error of depth (m) or area (%) of the matched pockets."""
-    if not len(reference_pockets(case)):
+    if not len(lining.reference_pockets(case)):
         return missing(_NO_POCKETS)
-    pairs = matched_pockets(case)
+    pairs = lining.matched_pockets(case)
     if not len(pairs):
         return Value(None, None, 0, _NO_MATCH, failed=True)
-    judged, reference = judged_pockets(case), reference_pockets(case)
+    judged, reference = lining.judged_pockets(case), lining.reference_pockets(case)
     size, real = getattr(judged, name)[pairs[:, 0]], getattr(reference, name)[pairs[:, 1]]
     error = size - real if name == "depth" else 100.0 * (size / real - 1.0)
     return Samples(error, reference.station[pairs[:, 1]])
@@ -277,10 +256,10 @@ def matched_pocket_error(case: Case, name: str) -> Value | Samples:
 @metric("lin_axial_pitch_err", "LIN", D(1e-06, 10), "%", needs="reference")
 def lin_axial_pitch_err(case: Case) -> Value:
     """Relative error of the pitch of the rings along the tunnel, %."""
-    reference = reference_pitch(case)
+    reference = lining.reference_pitch(case)
     if reference is None:
         return missing(_NO_POCKETS)
-    judged = ring_pitch(both_maps(case)[0], reference, RING_BAND)
+    judged = lining.ring_pitch(lining.both_maps(case)[0], reference, lining.RING_BAND)
     if judged is None:
         return number(_NO_GRID, 0, "the lining has no relief")
     return number(100.0 * abs(judged / reference - 1.0), 1, f"{judged:.4f} m against {reference:.4f} m")
@@ -289,7 +268,9 @@ def lin_axial_pitch_err(case: Case) -> Value:
 @metric("lin_circ_pitch_err", "LIN", D(1e-06, 15), "%", needs="reference")
 def lin_circ_pitch_err(case: Case) -> Value:
     """Relative error of the median distance between rows of pockets around the section, %."""
-    judged, reference = (np.diff(pocket_rows(side, reference_arc(case))) for side in both_maps(case))
+    judged, reference = (
+        np.diff(lining.pocket_rows(side, lining.reference_arc(case))) for side in lining.both_maps(case)
+    )
     if not len(reference):
         return missing(_NO_POCKETS)
     if not len(judged):
@@ -300,14 +281,14 @@ def lin_circ_pitch_err(case: Case) -> Value:
 @metric("lin_ring_phase_err", "LIN", D(1e-06, 0.25), needs="reference", of=mean)
 def lin_ring_phase_err(case: Case) -> Value | Samples:
     """Mean absolute error of the grid's phase in windows of four pitches, share of a pitch."""
-    length = reference_pitch(case)
+    length = lining.reference_pitch(case)
     if length is None:
         return missing(_NO_POCKETS)
-    judged, reference = (ring_phases(side, length) for side in both_maps(case))
+    judged, reference = (lining.ring_phases(side, length) for side in lining.both_maps(case))
     count = min(len(judged), len(reference))
     gap = np.abs((judged[:count] - reference[:count] + np.pi) % (2 * np.pi) - np.pi) / (2 * np.pi)
     share = np.where(np.isnan(judged[:count]), _UNKNOWN_PHASE, gap)
-    centre = length * PHASE_PITCHES / 2 * (1 + np.arange(count))
+    centre = length * lining.PHASE_PITCHES / 2 * (1 + np.arange(count))
     return Samples(share, centre)
 
 

@@ -9,14 +9,7 @@ from packaging.requirements import Requirement
 from scipy.spatial import cKDTree
 
 from benchmarks.fidelity.case import Case
-from benchmarks.fidelity.derive import planar
-from benchmarks.fidelity.derive.contact import (
-    contact_depths,
-    first_contacts,
-    path_divergence,
-    probe_free,
-    step_is_finite,
-)
+from benchmarks.fidelity.derive import contact, planar
 from benchmarks.fidelity.derive.scene import (
     LINING_NAMES,
     asset_files,
@@ -90,7 +83,7 @@ def _push_robot(case: Case) -> tuple[np.ndarray, int, float]:
 @metric("mj_probe_free_frac", "SCN", U(0.99, 1), gate=True)
 def mj_probe_free_frac(case: Case) -> Value:
     """Share of axis stations where a sphere of 0.3 m touches nothing."""
-    free = probe_free(case)
+    free = contact.probe_free(case)
     return number(free.mean(), len(free))
 
 
@@ -100,7 +93,7 @@ def mj_wall_contact_err(case: Case) -> Value:
 
     Of several sets of walls, for bodies that collide with different bits, the finest one counts.
     """
-    sets, expected = first_contacts(case)
+    sets, expected = contact.first_contacts(case)
     errors = [float(np.median(np.abs(made - expected))) for made in sets]
     reason = "by set of walls: " + ", ".join(f"{1e3 * error:.1f} mm" for error in errors)
     return number(errors[0], len(expected), reason)
@@ -195,7 +188,7 @@ def mj_step_rate(case: Case) -> Value:
 def mjx_put_model(case: Case) -> Value:
     """MJX accepts the whole released scene and makes one compiled step."""
     try:
-        return pass_or_fail(step_is_finite(case))
+        return pass_or_fail(contact.step_is_finite(case))
     except (NotImplementedError, ValueError, RuntimeError) as error:
         return pass_or_fail(False, f"{type(error).__name__}: {error}"[:200])
 
@@ -211,7 +204,7 @@ def mjx_ray_parity(case: Case) -> Value:
 @metric("mjx_contact_parity", "PAR", U(0.95, 1))
 def mjx_contact_parity(case: Case) -> Value:
     """Share of 200 placements of the robot with the same contact decision and a depth within 1 mm."""
-    ours, theirs = contact_depths(case)
+    ours, theirs = contact.contact_depths(case)
     same = ((ours < 0.0) == (theirs < 0.0)) & (np.abs(ours - theirs) <= _SAME_DEPTH)
     return number(same.mean(), len(same), f"{np.mean(ours < 0.0):.0%} of them in contact")
 
@@ -219,7 +212,7 @@ def mjx_contact_parity(case: Case) -> Value:
 @metric("mjx_traj_divergence", "PAR", D(0.001, 0.05), "m")
 def mjx_traj_divergence(case: Case) -> Value:
     """Largest distance of the robot between MuJoCo and MJX over 100 steps, m."""
-    gap = path_divergence(case)
+    gap = contact.path_divergence(case)
     return number(gap.max(), len(gap))
 
 

@@ -4,6 +4,7 @@ import numpy as np
 from scipy.stats import ks_2samp, norm, spearmanr, trim_mean, wasserstein_distance
 
 from benchmarks.fidelity.case import Case
+from benchmarks.fidelity.derive import clouds, degeneracy
 from benchmarks.fidelity.derive.beams import (
     beam_directions,
     cast_beams,
@@ -12,24 +13,6 @@ from benchmarks.fidelity.derive.beams import (
     returns,
     scan_descriptors,
     silence,
-)
-from benchmarks.fidelity.derive.clouds import (
-    Planes,
-    map_distances,
-    mean_entropy,
-    own_consistency,
-    plane_rows,
-    real_planes,
-    spatial_consistency,
-    synthetic_planes,
-    synthetic_tree,
-)
-from benchmarks.fidelity.derive.degeneracy import (
-    ScanInformation,
-    alias_ratios,
-    icp_errors,
-    information,
-    localised_stations,
 )
 from benchmarks.fidelity.derive.distances import BOOTSTRAP_SAMPLES, self_cast
 from benchmarks.fidelity.registry import Samples, Value, mean_magnitude, missing, number, percentile
@@ -202,12 +185,14 @@ def _ranges_by_bin(case: Case, group: np.ndarray) -> list[tuple[np.ndarray, np.n
 @metric("incidence_w1", "DIS", D(0.341, 12), "deg", needs="hold")
 def incidence_w1(case: Case) -> Value:
     """Wasserstein-1 distance of the incidence angles, normals of both clouds by local planes, degrees."""
-    real, synthetic = (_incidence_angles(case, planes) for planes in (real_planes(case), synthetic_planes(case)))
+    real, synthetic = (
+        _incidence_angles(case, planes) for planes in (clouds.real_planes(case), clouds.synthetic_planes(case))
+    )
     return number(float(wasserstein_distance(real, synthetic)), len(real))
 
 
-def _incidence_angles(case: Case, planes: Planes) -> np.ndarray:
-    cosine = np.abs(np.einsum("ij,ij->i", planes.normal, returns(case).direction[plane_rows(case)]))
+def _incidence_angles(case: Case, planes: clouds.Planes) -> np.ndarray:
+    cosine = np.abs(np.einsum("ij,ij->i", planes.normal, returns(case).direction[clouds.plane_rows(case)]))
     return np.rad2deg(np.arccos(np.minimum(cosine[np.isfinite(cosine)], 1.0)))
 
 
@@ -224,29 +209,29 @@ def dropout_diff(case: Case) -> Value:
 @metric("noise_sigma_diff", "DIS", D(0.0068, 0.03), "m", needs="hold")
 def noise_sigma_diff(case: Case) -> Value:
     """Difference of the median spread about local planes, m."""
-    sigma = [float(np.nanmedian(planes.sigma)) for planes in (real_planes(case), synthetic_planes(case))]
-    return number(abs(sigma[0] - sigma[1]), len(plane_rows(case)))
+    sigma = [float(np.nanmedian(planes.sigma)) for planes in (clouds.real_planes(case), clouds.synthetic_planes(case))]
+    return number(abs(sigma[0] - sigma[1]), len(clouds.plane_rows(case)))
 
 
 @metric("awd", "DIS", D(0.028, 0.4), "m", needs="hold")
 def awd(case: Case) -> Value:
     """Mean Wasserstein distance of the points in voxels of 0.5 m, m."""
-    _, distance = map_distances(case)
+    _, distance = clouds.map_distances(case)
     return number(float(np.mean(distance)), len(distance))
 
 
 @metric("scs_diff", "DIS", needs="hold")
 def scs_diff(case: Case) -> Value:
     """Spatial consistency score against the synthetic map less that of two halves of the held-out cloud."""
-    key, distance = map_distances(case)
-    return number(abs(spatial_consistency(key, distance) - own_consistency(case)), len(distance))
+    key, distance = clouds.map_distances(case)
+    return number(abs(clouds.spatial_consistency(key, distance) - clouds.own_consistency(case)), len(distance))
 
 
 @metric("mme_diff", "DIS", D(0.325, 2), "nat", needs="hold")
 def mme_diff(case: Case) -> Value:
     """Difference of the mean map entropies, nat."""
-    cloud, tree = synthetic_tree(case)
-    return number(abs(mean_entropy(cloud_tree(case), returns(case).points) - mean_entropy(tree, cloud)))
+    cloud, tree = clouds.synthetic_tree(case)
+    return number(abs(clouds.mean_entropy(cloud_tree(case), returns(case).points) - clouds.mean_entropy(tree, cloud)))
 
 
 @metric("c2st_auc", "DIS", D(0.505, 0.95), needs="hold")
@@ -274,11 +259,11 @@ def c2st_auc(case: Case) -> Value:
 # DEG: whether a scan in the candidate fixes its own pose as well, and as badly, as the recorded one.
 
 
-def _both_information(case: Case) -> tuple[ScanInformation, ScanInformation]:
-    return information(case, True), information(case, False)
+def _both_information(case: Case) -> tuple[degeneracy.ScanInformation, degeneracy.ScanInformation]:
+    return degeneracy.information(case, True), degeneracy.information(case, False)
 
 
-def _condition(scans: ScanInformation) -> np.ndarray:
+def _condition(scans: degeneracy.ScanInformation) -> np.ndarray:
     return scans.translation[:, 2] / scans.translation[:, 0]
 
 
@@ -292,7 +277,7 @@ def information_logratio(case: Case, quantity) -> Samples:
     real, synthetic = (quantity(scans) for scans in _both_information(case))
     log = np.abs(np.log10(synthetic / real))
     log = np.where(np.isfinite(real) & ~np.isfinite(synthetic), LOST, log)
-    return Samples(log, information(case, True).station)
+    return Samples(log, degeneracy.information(case, True).station)
 
 
 @metric("deg_weak_angle_diff", "DEG", D(0.083, 25), "deg", needs="hold", of=np.median)
@@ -354,20 +339,20 @@ def deg_landmark_diff(case: Case) -> Value:
         known = np.isfinite(scans.axial)
         excess = np.log10(CONDITION * scans.axial[known] / scans.translation[known, 2])
         counts.append(100.0 * float(norm.cdf(excess / SPREAD).sum()) / len(known))
-    return number(abs(counts[0] - counts[1]), len(information(case, True).axial))
+    return number(abs(counts[0] - counts[1]), len(degeneracy.information(case, True).axial))
 
 
 @metric("deg_alias_diff", "DEG", D(0.105, 0.6), needs="hold")
 def deg_alias_diff(case: Case) -> Value:
     """Difference of the median alias ratios."""
-    real, synthetic = alias_ratios(case, True), alias_ratios(case, False)
+    real, synthetic = degeneracy.alias_ratios(case, True), degeneracy.alias_ratios(case, False)
     return number(abs(float(np.median(real)) - float(np.median(synthetic))), len(real))
 
 
 @metric("deg_icp_axial_logratio", "DEG", needs="hold")
 def deg_icp_axial_logratio(case: Case) -> Value:
     """|log10| of the ratio of median axial errors of scan-to-scan registration."""
-    real, synthetic = icp_errors(case, True), icp_errors(case, False)
+    real, synthetic = degeneracy.icp_errors(case, True), degeneracy.icp_errors(case, False)
     if not len(real):
         return missing("no two scans with enough returns")
     return number(abs(float(np.log10(np.median(synthetic) / np.median(real)))), len(real))
@@ -376,4 +361,4 @@ def deg_icp_axial_logratio(case: Case) -> Value:
 @metric("deg_planar_axial_info", "DEG")
 def deg_planar_axial_info(case: Case) -> Value:
     """Share of stations at which the environment's planar scan alone fixes the station."""
-    return number(float(np.mean(localised_stations(case))), len(localised_stations(case)))
+    return number(float(np.mean(degeneracy.localised_stations(case))), len(degeneracy.localised_stations(case)))

@@ -4,15 +4,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from benchmarks.fidelity.case import Case
+from benchmarks.fidelity.derive import freespace, plane
 from benchmarks.fidelity.derive.axis import hold_points, reference_curve
-from benchmarks.fidelity.derive.freespace import (
-    air_voxels,
-    axis_clearances,
-    carve_beams,
-    carved_about,
-    headrooms,
-    infringements,
-)
 from benchmarks.fidelity.derive.ground import (
     ROBOT_RADIUS,
     Route,
@@ -22,15 +15,6 @@ from benchmarks.fidelity.derive.ground import (
     draw_trips,
     feasible_trips,
     judged_route,
-)
-from benchmarks.fidelity.derive.plane import (
-    cell_distances,
-    edge_cells,
-    free_plane,
-    free_widths,
-    gapless_maps,
-    medial_axis,
-    unknown_share,
 )
 from benchmarks.fidelity.derive.sections import lining_radii, sections
 from benchmarks.fidelity.derive.surface import surface_nearest
@@ -51,51 +35,51 @@ _NO_REFERENCE = "the reference shows no way from mouth to mouth"
 
 def _agreement(case: Case, among: np.ndarray, both: np.ndarray) -> Samples:
     """Share of the cells `among` that are free in `both`, where the reference is known."""
-    picked = among & free_plane(case).known
-    station = np.broadcast_to(free_plane(case).station[:, None], picked.shape)[picked]
+    picked = among & plane.free_plane(case).known
+    station = np.broadcast_to(plane.free_plane(case).station[:, None], picked.shape)[picked]
     return Samples(both[picked].astype(float), station)
 
 
 @metric("occ2d_free_iou", "F2D", U(0.85, 0.99624), gate=True, needs="reference", of=mean)
 def occ2d_free_iou(case: Case) -> Samples:
     """Intersection over union of the free cells, where the reference is known."""
-    judged, reference = free_plane(case).judged, free_plane(case).reference
+    judged, reference = plane.free_plane(case).judged, plane.free_plane(case).reference
     return _agreement(case, judged | reference, judged & reference)
 
 
 @metric("occ2d_free_precision", "F2D", U(0.9, 0.999462), needs="reference", of=mean)
 def occ2d_free_precision(case: Case) -> Samples:
     """Share of the candidate's free cells that are free in the reference."""
-    return _agreement(case, free_plane(case).judged, free_plane(case).reference)
+    return _agreement(case, plane.free_plane(case).judged, plane.free_plane(case).reference)
 
 
 @metric("occ2d_free_recall", "F2D", U(0.9, 0.99678), needs="reference", of=mean)
 def occ2d_free_recall(case: Case) -> Samples:
     """Share of the reference's free cells that are free in the candidate."""
-    return _agreement(case, free_plane(case).reference, free_plane(case).judged)
+    return _agreement(case, plane.free_plane(case).reference, plane.free_plane(case).judged)
 
 
 @metric("occ2d_boundary_f1", "F2D", U(0.5, 0.999999), needs="reference")
 def occ2d_boundary_f1(case: Case) -> Value:
     """F1 of the edges of free space, matched within 10 cm."""
-    judged, reference = (edge_cells(free) for free in gapless_maps(case)[:2])
-    edge, reach = free_plane(case).lattice.edge, _EDGE_NEAR * case.tolerance + 1e-9
-    precision = mean(cell_distances(judged, reference, edge) <= reach)
-    recall = mean(cell_distances(reference, judged, edge) <= reach)
+    judged, reference = (plane.edge_cells(free) for free in plane.gapless_maps(case)[:2])
+    edge, reach = plane.free_plane(case).lattice.edge, _EDGE_NEAR * case.tolerance + 1e-9
+    precision = mean(plane.cell_distances(judged, reference, edge) <= reach)
+    recall = mean(plane.cell_distances(reference, judged, edge) <= reach)
     return number(2 * precision * recall / max(precision + recall, 1e-12), int(judged.sum() + reference.sum()))
 
 
 @metric("free2d_area_rel_err", "F2D", D(0.269, 8), "%", needs="reference")
 def free2d_area_rel_err(case: Case) -> Value:
     """Relative error of the free area, %."""
-    judged, reference, _ = gapless_maps(case)
+    judged, reference, _ = plane.gapless_maps(case)
     return number(100.0 * abs(judged.sum() / max(reference.sum(), 1) - 1.0), int(reference.sum()))
 
 
 @metric("free2d_width_mae", "F2D", D(1e-06, 0.055), "m", needs="reference", of=mean)
 def free2d_width_mae(case: Case) -> Samples:
     """Mean absolute error of the free width, m; an open side counts as 20 m."""
-    station, judged, reference = free_widths(case)
+    station, judged, reference = plane.free_widths(case)
     error = np.abs(np.minimum(judged, _WIDEST) - np.minimum(reference, _WIDEST))
     return Samples(error, station)
 
@@ -103,16 +87,16 @@ def free2d_width_mae(case: Case) -> Samples:
 @metric("free2d_width_min_err", "F2D", D(1e-06, 0.12), "m", needs="reference")
 def free2d_width_min_err(case: Case) -> Value:
     """Absolute error of the narrowest width, m."""
-    _, judged, reference = free_widths(case)
+    _, judged, reference = plane.free_widths(case)
     return number(abs(float(np.min(judged)) - float(np.min(reference))), len(judged))
 
 
 @metric("free2d_edt_rmse", "F2D", D(0.0302, 0.14), "m", needs="reference", of=root_of_mean)
 def free2d_edt_rmse(case: Case) -> Samples:
     """Root mean square error of the distance to the edge of free space, where either is free, m."""
-    judged, reference, rows = gapless_maps(case)
+    judged, reference, rows = plane.gapless_maps(case)
     picked = judged | reference
-    clear = [_edge_distance(free, free_plane(case).lattice.edge) for free in (judged, reference)]
+    clear = [_edge_distance(free, plane.free_plane(case).lattice.edge) for free in (judged, reference)]
     station = np.broadcast_to(rows[:, None], picked.shape)[picked]
     return Samples(((clear[0] - clear[1]) ** 2)[picked], station)
 
@@ -120,22 +104,22 @@ def free2d_edt_rmse(case: Case) -> Samples:
 def _edge_distance(free: np.ndarray, edge: float) -> np.ndarray:
     if not free.any():
         return np.zeros(free.shape)
-    return cell_distances(np.ones_like(free), ~free, edge).reshape(free.shape)
+    return plane.cell_distances(np.ones_like(free), ~free, edge).reshape(free.shape)
 
 
 @metric("free2d_skeleton_p95", "F2D", D(0.101, 0.6), "m", needs="reference")
 def free2d_skeleton_p95(case: Case) -> Value:
     """95th percentile of the distance between the medial axes, both ways, m."""
-    judged, reference = (medial_axis(free) for free in gapless_maps(case)[:2])
-    edge = free_plane(case).lattice.edge
-    apart = [cell_distances(judged, reference, edge), cell_distances(reference, judged, edge)]
+    judged, reference = (plane.medial_axis(free) for free in plane.gapless_maps(case)[:2])
+    edge = plane.free_plane(case).lattice.edge
+    apart = [plane.cell_distances(judged, reference, edge), plane.cell_distances(reference, judged, edge)]
     return number(float(np.percentile(np.concatenate(apart), 95)), sum(map(len, apart)))
 
 
 @metric("occ2d_unknown_frac", "F2D", needs="hold")
 def occ2d_unknown_frac(case: Case) -> Value:
     """Share of the candidate's free cells that no held-out beam shows."""
-    return number(unknown_share(case), int(free_plane(case).judged.sum()))
+    return number(plane.unknown_share(case), int(plane.free_plane(case).judged.sum()))
 
 
 # F3D: free space in three dimensions, along the reference axis.
@@ -144,7 +128,7 @@ def occ2d_unknown_frac(case: Case) -> Value:
 @metric("free3d_iou", "F3D", U(0.85, 0.998), gate=True, needs="reference", of=mean)
 def free3d_iou(case: Case) -> Samples:
     """Intersection over union of free voxels, where the reference is known."""
-    both = air_voxels(case)
+    both = freespace.air_voxels(case)
     either = (both.judged | both.reference) & both.known
     station = both.lattice.low[0] + both.lattice.edge * np.nonzero(either)[0]
     return Samples((both.judged & both.reference)[either].astype(float), station)
@@ -153,7 +137,7 @@ def free3d_iou(case: Case) -> Samples:
 @metric("free3d_volume_rel_err", "F3D", D(0.0161, 8), "%", needs="reference")
 def free3d_volume_rel_err(case: Case) -> Value:
     """Relative error of the free volume, where the reference is known, %."""
-    both = air_voxels(case)
+    both = freespace.air_voxels(case)
     judged, reference = ((side & both.known).sum() for side in (both.judged, both.reference))
     return number(100.0 * abs(judged / max(reference, 1) - 1.0), int(reference))
 
@@ -175,8 +159,8 @@ def free3d_false_occupied(case: Case) -> Samples:
 
     Occupied is whatever lies 5 cm outside its lining, and what its extra surfaces fill or close off.
     """
-    passed, both = carve_beams(case).passed, air_voxels(case)
-    local = carved_about(case, reference_curve(case))[0]
+    passed, both = freespace.carve_beams(case).passed, freespace.air_voxels(case)
+    local = freespace.carved_about(case, reference_curve(case))[0]
     outside = lining_radii(case).depth(passed) < -_RADII_SLACK
     if len(case.candidate.extra.faces):
         cell, kept = both.lattice.cell(local)
@@ -189,7 +173,7 @@ def free3d_false_occupied(case: Case) -> Samples:
 @metric("free3d_esdf_rmse", "F3D", D(1e-06, 0.3), "m", needs="reference", of=root_of_mean)
 def free3d_esdf_rmse(case: Case) -> Samples:
     """Root mean square error of the distance to the nearest surface within 1 m of the axis, m."""
-    both = axis_clearances(case)
+    both = freespace.axis_clearances(case)
     error = both.judged - both.reference
     station = np.repeat(both.station, error.shape[1])
     return Samples((error**2).ravel(), station)
@@ -198,7 +182,7 @@ def free3d_esdf_rmse(case: Case) -> Samples:
 @metric("free3d_inscribed_err", "F3D", D(1e-06, 0.3), "m", needs="reference", of=mean)
 def free3d_inscribed_err(case: Case) -> Samples:
     """Mean absolute error of the radius of the largest sphere near the axis, m."""
-    both = axis_clearances(case)
+    both = freespace.axis_clearances(case)
     error = np.abs(both.judged.max(axis=1) - both.reference.max(axis=1))
     return Samples(error, both.station)
 
@@ -206,7 +190,7 @@ def free3d_inscribed_err(case: Case) -> Samples:
 @metric("free3d_headroom_rmse", "F3D", D(1e-06, 0.06), "m", needs="reference", of=root_of_mean)
 def free3d_headroom_rmse(case: Case) -> Samples:
     """Root mean square error of floor to crown in three lanes, m."""
-    station, judged, reference = headrooms(case)
+    station, judged, reference = freespace.headrooms(case)
     squares = (judged - reference) ** 2
     lanes = np.repeat(station, squares.shape[1])
     return Samples(squares.ravel(), lanes)
@@ -215,7 +199,7 @@ def free3d_headroom_rmse(case: Case) -> Samples:
 @metric("free3d_envelope_agree", "F3D", U(0.9, 0.999999), needs="reference", of=mean)
 def free3d_envelope_agree(case: Case) -> Samples:
     """Share of sections and envelopes in which lining and reference agree whether the envelope is cut into."""
-    judged, reference = infringements(case)
+    judged, reference = freespace.infringements(case)
     agree = (judged == reference).mean(axis=1)
     return Samples(agree, sections(case).station)
 
@@ -236,7 +220,7 @@ def free3d_hold_poses_free(case: Case) -> Samples:
 @metric("free3d_voxel_vs_mesh_vol", "F3D", unit="%", needs="reference", evidence="S")
 def free3d_voxel_vs_mesh_vol(case: Case) -> Value:
     """Difference between the volume of the voxels inside the lining and that of the solid, %."""
-    both, radii = air_voxels(case), lining_radii(case)
+    both, radii = freespace.air_voxels(case), lining_radii(case)
     inside = both.judged | both.blocked
     share = (both.lattice.shape[0] * both.lattice.edge) / radii.curve.length
     volume = abs(float(case.candidate.solid.volume)) * min(share, 1.0)

@@ -5,19 +5,8 @@ from jaxtyping import Int
 from scipy.spatial import cKDTree
 
 from benchmarks.fidelity.case import Case
+from benchmarks.fidelity.derive import track
 from benchmarks.fidelity.derive.scene import fastening_sets, seat_mismatches
-from benchmarks.fidelity.derive.track import (
-    STANDARD_GAUGE,
-    candidate_gauge,
-    candidate_sleepers,
-    rail_gaps,
-    rail_offsets,
-    rail_twist,
-    reference_railway,
-    reference_sleepers,
-    sleeper_spacings,
-    sleepers_fit,
-)
 from benchmarks.fidelity.registry import Samples, Statistic, Value, missing, number, rms
 from benchmarks.fidelity.table import B, D, U, metric
 
@@ -32,7 +21,7 @@ _NO_TRACK = "the candidate has no track"
 @metric("trk_sleeper_f1", "TRK", U(0.7, 0.999999), gate=True, needs="reference")
 def trk_sleeper_f1(case: Case) -> Value:
     """F1 of sleepers that are each other's nearest within 0.15 m; 0 where the truth has none but the candidate."""
-    real, judged = reference_sleepers(reference_railway(case)), candidate_sleepers(case)
+    real, judged = track.reference_sleepers(track.reference_railway(case)), track.candidate_sleepers(case)
     if not len(real) and (case.truth is None or not len(judged)):
         return missing(_NO_SLEEPERS)
     if not len(real) or not len(judged):
@@ -46,7 +35,7 @@ def trk_sleeper_f1(case: Case) -> Value:
 @metric("trk_sleeper_count_rel_err", "TRK", D(1e-06, 8), "%", needs="reference")
 def trk_sleeper_count_rel_err(case: Case) -> Value:
     """Relative difference of counts, %."""
-    real, judged = reference_sleepers(reference_railway(case)), candidate_sleepers(case)
+    real, judged = track.reference_sleepers(track.reference_railway(case)), track.candidate_sleepers(case)
     if not len(real):
         return missing(_NO_SLEEPERS)
     return number(100.0 * abs(len(judged) - len(real)) / len(real), len(real))
@@ -56,8 +45,8 @@ def trk_sleeper_count_rel_err(case: Case) -> Value:
 @metric("trk_sleeper_spacing_std_err", "TRK", D(1e-06, 0.06), "m", needs="reference", args=(np.std,))
 def spacing_error(case: Case, statistic: Statistic) -> Value:
     """Difference of mean or standard deviation of the spacings, missing sleepers left out, m."""
-    real = sleeper_spacings(reference_sleepers(reference_railway(case)))
-    judged = sleeper_spacings(candidate_sleepers(case))
+    real = track.sleeper_spacings(track.reference_sleepers(track.reference_railway(case)))
+    judged = track.sleeper_spacings(track.candidate_sleepers(case))
     if not len(real):
         return missing(_NO_SLEEPERS)
     if not len(judged):
@@ -70,18 +59,18 @@ def trk_sleeper_in_bore(case: Case) -> Value:
     """Share of sleepers whose top keeps 2 cm from the wall of the local section."""
     if not len(case.candidate.track.sleeper):
         return missing(_NO_TRACK)
-    fits = sleepers_fit(case, _BORE_MARGIN)
+    fits = track.sleepers_fit(case, _BORE_MARGIN)
     return number(float(np.mean(fits)), len(fits))
 
 
 def _reference_gauge(case: Case) -> tuple[float | None, str]:
     """Return the gauge to be met and its source; `None` where the reference shows no rails."""
-    reference = reference_railway(case)
+    reference = track.reference_railway(case)
     if not reference.rail.shape[1]:
         return None, _NO_RAILS
     if reference.gauge is not None:
         return reference.gauge, "against the truth's own rails"
-    return STANDARD_GAUGE, "K: against the standard gauge, held-out returns being too coarse for millimetres"
+    return track.STANDARD_GAUGE, "K: against the standard gauge, held-out returns being too coarse for millimetres"
 
 
 @metric("trk_gauge_mean_err", "TRK", D(1e-06, 10), "mm", gate=True, needs="reference", evidence="HTK")
@@ -90,7 +79,7 @@ def trk_gauge_mean_err(case: Case) -> Value:
     asked, reason = _reference_gauge(case)
     if asked is None:
         return missing(reason)
-    return number(1e3 * abs(candidate_gauge(case).mean() - asked), len(candidate_gauge(case)), reason)
+    return number(1e3 * abs(track.candidate_gauge(case).mean() - asked), len(track.candidate_gauge(case)), reason)
 
 
 @metric("trk_gauge_p95_dev", "TRK", D(0.000524, 10), "mm", needs="reference", evidence="HTK")
@@ -99,7 +88,7 @@ def trk_gauge_p95_dev(case: Case) -> Value:
     asked, reason = _reference_gauge(case)
     if asked is None:
         return missing(reason)
-    gauge = candidate_gauge(case)
+    gauge = track.candidate_gauge(case)
     return number(1e3 * np.percentile(np.abs(gauge - asked), 95), len(gauge), reason)
 
 
@@ -107,9 +96,9 @@ def trk_gauge_p95_dev(case: Case) -> Value:
 @metric("trk_rail_height_rmse", "TRK", D(1e-06, 0.12), "m", needs="reference", of=rms, args=(2,))
 def rail_offset(case: Case, column: int) -> Value | Samples:
     """Root mean square offset of the track's middle (1 lateral, 2 in height), m."""
-    if not reference_railway(case).rail.shape[1]:
+    if not track.reference_railway(case).rail.shape[1]:
         return missing(_NO_RAILS)
-    offsets = rail_offsets(case)
+    offsets = track.rail_offsets(case)
     return Samples(offsets[:, column], offsets[:, 0])
 
 
@@ -118,13 +107,13 @@ def trk_rail_gap_max(case: Case) -> Value:
     """Longest stretch between the first and the last sleeper that a rail leaves out, m."""
     if not len(case.candidate.track.sleeper):
         return missing(_NO_TRACK)
-    return number(max(rail_gaps(case)), 2)
+    return number(max(track.rail_gaps(case)), 2)
 
 
 @metric("trk_twist_p95", "TRK", unit="mm/m", evidence="K")
 def trk_twist_p95(case: Case) -> Value:
     """95th percentile of the change of the rails' difference in height over 3 m, mm/m."""
-    twist = 1e3 * np.abs(rail_twist(case, _TWIST_BASE))
+    twist = 1e3 * np.abs(track.rail_twist(case, _TWIST_BASE))
     if not len(twist):
         return missing(_NO_TRACK)
     return number(np.percentile(twist, 95), len(twist), "K: railway practice judges twist on a base of 3 m")

@@ -10,22 +10,8 @@ from scipy.signal import savgol_filter
 from scipy.stats import theilslopes
 
 from benchmarks.fidelity.case import Case, kept_until, per_case, per_hold
+from benchmarks.fidelity.derive import curve as curves
 from benchmarks.fidelity.derive.beams import returns
-from benchmarks.fidelity.derive.curve import (
-    ROW_STEP,
-    SECTOR,
-    SLICE,
-    Curve,
-    candidate_curve,
-    cast_profile,
-    crown_and_floor,
-    point_profile,
-    running_median,
-    section_angles,
-    section_middle,
-    smooth_along,
-    truth_curve,
-)
 from benchmarks.fidelity.derive.surface import Caster, sample_surface, visible_surface
 
 _SEED_APART = 0.9  # m between the sensor positions that begin the axis: a second pass adds none
@@ -36,9 +22,9 @@ _MOST_POINTS = 400_000
 _KNOWN_SHARE = 0.6  # share of the sectors that makes a slice count
 
 
-def reference_curve(case: Case) -> Curve:
+def reference_curve(case: Case) -> curves.Curve:
     """Return the generator's axis where there is a truth, otherwise the held-out recording's."""
-    return truth_curve(case) if case.truth is not None else hold_curve(case)
+    return curves.truth_curve(case) if case.truth is not None else hold_curve(case)
 
 
 @per_hold
@@ -49,7 +35,7 @@ def hold_points(case: Case) -> Float[np.ndarray, "k 3"]:
 
 
 @per_hold
-def seed_path(case: Case) -> Curve:
+def seed_path(case: Case) -> curves.Curve:
     """Return the path of the sensor, each place once."""
     assert case.hold is not None
     first = np.unique(case.hold.scan, return_index=True)[1]
@@ -59,15 +45,15 @@ def seed_path(case: Case) -> Curve:
             kept.append(here)
     if len(kept) < 4:
         raise ValueError("the held-out recording moves too little to show an axis")
-    path = Curve.through(np.array(kept))
+    path = curves.Curve.through(np.array(kept))
     station = np.linspace(0.0, path.length, max(int(path.length), 4) + 1)
     even = path.frames(station)[0]
     # A vehicle sways; frames that sway with it would cut the bore askew.
-    return Curve.through(smooth_along(even, station[1], _SEED_CALM))
+    return curves.Curve.through(curves.smooth_along(even, station[1], _SEED_CALM))
 
 
 @per_hold
-def hold_curve(case: Case) -> Curve:
+def hold_curve(case: Case) -> curves.Curve:
     """Estimates the axis of the held-out recording: the middle of width and height, by medians of polar radii.
 
     Method: 0.5 m slices across the sensor's path, median radius of each 5 degree sector, their middle by mirrored
@@ -75,19 +61,19 @@ def hold_curve(case: Case) -> Curve:
     builder takes part.
     """
     curve, points, floor = seed_path(case), hold_points(case), None
-    angle = section_angles(round(2 * np.pi / SECTOR))
+    angle = curves.section_angles(round(2 * np.pi / curves.SECTOR))
     for _ in range(_ROUNDS):
         local = curve.local(points)
         low, high = np.percentile(local[:, 0], [0.5, 99.5])
-        station = np.arange(low, high, SLICE)
-        profile = running_median(point_profile(local, station, floor), SLICE)
+        station = np.arange(low, high, curves.SLICE)
+        profile = curves.running_median(curves.point_profile(local, station, floor), curves.SLICE)
         complete = np.isfinite(profile).mean(axis=1) > _KNOWN_SHARE
         if complete.sum() < 4:
             raise ValueError("the held-out recording shows too little of the section")
         keep = slice(np.flatnonzero(complete)[0], np.flatnonzero(complete)[-1] + 1)
-        offset = smooth_along(section_middle(profile[keep], angle), SLICE, _AXIS_SMOOTH)
-        floor = float(np.nanmedian(crown_and_floor(profile[keep], angle)[1])) - float(np.median(offset[:, 1]))
-        curve = Curve.through(curve.point(np.column_stack([station[keep], offset])))
+        offset = curves.smooth_along(curves.section_middle(profile[keep], angle), curves.SLICE, _AXIS_SMOOTH)
+        floor = float(np.nanmedian(curves.crown_and_floor(profile[keep], angle)[1])) - float(np.median(offset[:, 1]))
+        curve = curves.Curve.through(curve.point(np.column_stack([station[keep], offset])))
     return curve
 
 
@@ -120,20 +106,20 @@ def surface_extent(local: Float[np.ndarray, "k 3"]) -> tuple[float, float]:
 
 
 @per_case
-def lining_curve(case: Case) -> Curve:
+def lining_curve(case: Case) -> curves.Curve:
     """Estimates the axis of the lining itself: the middle of width and height of its sections, mouth to mouth.
 
     The declared centreline only says from where the sections are looked at.
     """
-    declared, angle = candidate_curve(case), section_angles(120)
+    declared, angle = curves.candidate_curve(case), curves.section_angles(120)
     low, high = surface_extent(declared.local(np.asarray(case.candidate.lining.vertices)))
-    station = np.linspace(low, high, max(round((high - low) / ROW_STEP), 4) + 1)
+    station = np.linspace(low, high, max(round((high - low) / curves.ROW_STEP), 4) + 1)
     step = station[1] - station[0]
     inner = station.copy()
     inner[0], inner[-1] = station[0] + 0.01, station[-1] - 0.01  # a ray in the very plane of the mouth may miss
-    profile = running_median(cast_profile(lining_caster(case), declared, inner, angle), step)
-    offset = smooth_along(section_middle(profile, angle), step, _AXIS_SMOOTH / 2)
-    return Curve.through(declared.point(np.column_stack([station, offset])))
+    profile = curves.running_median(curves.cast_profile(lining_caster(case), declared, inner, angle), step)
+    offset = curves.smooth_along(curves.section_middle(profile, angle), step, _AXIS_SMOOTH / 2)
+    return curves.Curve.through(declared.point(np.column_stack([station, offset])))
 
 
 # Offset and registration between the two axes, and drift of features along them.

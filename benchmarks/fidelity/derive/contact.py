@@ -11,15 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from benchmarks.fidelity.case import Case, kept_until
+from benchmarks.fidelity.derive import scene
 from benchmarks.fidelity.derive.curve import interpolate_rows
-from benchmarks.fidelity.derive.scene import (
-    lidar_elevation,
-    per_release,
-    placed_data,
-    random_stations,
-    robot_body,
-    scene_model,
-)
 from benchmarks.fidelity.derive.surface import surface_caster, surface_nearest
 
 PROBE_RADIUS = 0.3  # m
@@ -65,7 +58,7 @@ class Probe:
         return nearest
 
 
-@per_release("scene", "mesh")
+@scene.per_release("scene", "mesh")
 def probe_free(case: Case) -> Bool[np.ndarray, " k"]:
     """Return True where the probe touches nothing, at each station of the centreline."""
     bore, probe = case.candidate.bore, Probe(case)
@@ -76,7 +69,7 @@ def probe_free(case: Case) -> Bool[np.ndarray, " k"]:
     return np.array([probe.depth(place) >= 0.0 for place in middle])
 
 
-@per_release("scene", "mesh", "tunnel")
+@scene.per_release("scene", "mesh", "tunnel")
 def first_contacts(case: Case) -> tuple[list[Float[np.ndarray, " k"]], Float[np.ndarray, " k"]]:
     """Moves the probe from the middle to each wall at LiDAR height until it touches.
 
@@ -87,8 +80,8 @@ def first_contacts(case: Case) -> tuple[list[Float[np.ndarray, " k"]], Float[np.
         Offsets in MuJoCo for each bit that stands for walls, that of the most geoms first, and offsets at which the
         mesh is one radius away, m.
     """
-    station, start, left = random_stations(case, "mj_wall_contact_err", _WALL_STATIONS)
-    start[:, 2] = lidar_elevation(case, station)
+    station, start, left = scene.random_stations(case, "mj_wall_contact_err", _WALL_STATIONS)
+    start[:, 2] = scene.lidar_elevation(case, station)
     start, way = np.concatenate([start, start]), np.concatenate([left, -left])
     reach = surface_caster(case).first(start, way)[0]
     known = np.isfinite(reach)
@@ -103,7 +96,7 @@ def first_contacts(case: Case) -> tuple[list[Float[np.ndarray, " k"]], Float[np.
 
 def _wall_bits(case: Case) -> list[int]:
     """Return the bits that geoms of the scene collide by, that of the most geoms first."""
-    model = scene_model(case)
+    model = scene.scene_model(case)
     fixed = model.geom_bodyid == 0
     used = (model.geom_contype | model.geom_conaffinity)[fixed]
     count = {1 << k: int(np.sum(used >> k & 1)) for k in range(31)}
@@ -162,24 +155,24 @@ class Stepper:
         return self.data.replace(qpos=jax.numpy.asarray(qpos), qvel=jax.numpy.asarray(qvel))
 
 
-@kept_until("PAR", per_release("scene"))
+@kept_until("PAR", scene.per_release("scene"))
 def stepper(case: Case) -> Stepper:
     """Puts the scene on the device and compiles a step."""
-    model = scene_model(case)
+    model = scene.scene_model(case)
     device = mjx.put_model(model)
     data = mjx.make_data(device)
     step = jax.jit(mjx.step).lower(device, data).compile()
     return Stepper(lambda state: step(device, state), model, data)
 
 
-@per_release("scene")
+@scene.per_release("scene")
 def step_is_finite(case: Case) -> bool:
     compiled = stepper(case)
     after = compiled.step(compiled.data)
     return bool(np.isfinite(np.asarray(after.qpos)).all() and np.isfinite(np.asarray(after.qvel)).all())
 
 
-@per_release("scene", "tunnel", "mesh")
+@scene.per_release("scene", "tunnel", "mesh")
 def contact_depths(case: Case) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
     """Return the deepest contact of the robot at random places, by MuJoCo and by MJX, m; 0 without contact."""
     compiled = stepper(case)
@@ -198,8 +191,8 @@ def contact_depths(case: Case) -> tuple[Float[np.ndarray, " k"], Float[np.ndarra
 def _poses_by_wall(case: Case, model: mujoco.MjModel) -> Float[np.ndarray, "k q"]:
     """Return poses of the robot by either wall, from clear of it to a little inside, at random headings."""
     rng = case.rng("mjx_contact_parity")
-    station, middle, left = random_stations(case, "mjx_contact_parity", _PLACEMENTS)
-    adr = int(model.jnt_qposadr[model.body_jntadr[robot_body(model)]])
+    station, middle, left = scene.random_stations(case, "mjx_contact_parity", _PLACEMENTS)
+    adr = int(model.jnt_qposadr[model.body_jntadr[scene.robot_body(model)]])
     first = model.qpos0[adr : adr + 3]
     with np.load(case.candidate.tunnel) as tunnel:
         half = np.interp(station, tunnel["station"], tunnel["half_width"])
@@ -218,19 +211,19 @@ def _poses_by_wall(case: Case, model: mujoco.MjModel) -> Float[np.ndarray, "k q"
 
 def _robot_radius(model: mujoco.MjModel) -> float:
     """Return the largest horizontal reach of the robot's geoms from its origin, m."""
-    body = robot_body(model)
+    body = scene.robot_body(model)
     own = range(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body])
     return float(max(np.hypot(*model.geom_pos[k, :2]) + model.geom_size[k, 0] for k in own))
 
 
-@per_release("scene")
+@scene.per_release("scene")
 def path_divergence(case: Case) -> Float[np.ndarray, " k"]:
     """Return the distance between the robot's positions by MuJoCo and by MJX after each of 100 steps, m."""
     compiled = stepper(case)
-    body = robot_body(compiled.model)
+    body = scene.robot_body(compiled.model)
     joint = compiled.model.body_jntadr[body]
     place, speed = int(compiled.model.jnt_qposadr[joint]), int(compiled.model.jnt_dofadr[joint])
-    cpu = placed_data(compiled.model)
+    cpu = scene.placed_data(compiled.model)
     cpu.qvel[speed : speed + 3] = _PUSH_SPEEDS[0] * cpu.xmat[body].reshape(3, 3)[:, 0]
     cpu.qvel[speed + 5] = _PUSH_SPEEDS[1]
     device = compiled.at(cpu.qpos.copy(), cpu.qvel.copy())

@@ -9,14 +9,8 @@ from scipy.signal import find_peaks
 from scipy.spatial import cKDTree
 
 from benchmarks.fidelity.case import Case, per_case, per_side
+from benchmarks.fidelity.derive import clouds
 from benchmarks.fidelity.derive.beams import returns, sensor_path, side_points
-from benchmarks.fidelity.derive.clouds import (
-    few_rows,
-    plane_rows,
-    real_planes,
-    smooth_normals,
-    synthetic_planes,
-)
 from benchmarks.fidelity.derive.curve import interpolate_rows
 
 _FEWEST_POINTS = 20  # points of a scan
@@ -39,8 +33,8 @@ class ScanInformation:
 @per_side
 def information(case: Case, real: bool) -> ScanInformation:
     """Return Hessians of point-to-plane registration about the sensor, of the held-out scans or the candidate's."""
-    points, beams, pick = side_points(case, real), returns(case), few_rows(case)[1]
-    normal, arm, scan = smooth_normals(case, points), points[pick] - beams.origin[pick], beams.scan[pick]
+    points, beams, pick = side_points(case, real), returns(case), clouds.few_rows(case)[1]
+    normal, arm, scan = clouds.smooth_normals(case, points), points[pick] - beams.origin[pick], beams.scan[pick]
     starts = np.flatnonzero(np.concatenate([[True], np.diff(scan) != 0]))
     bounds = np.append(starts, len(scan))
     station = sensor_path(case).local(beams.origin[pick[starts]])[:, 0]
@@ -83,8 +77,8 @@ def alias_ratios(case: Case, real: bool) -> Float[np.ndarray, " s"]:
     The cost is the mean distance from the planes of the nearest map points, cut off at 0.3 m. Scans without a
     minimum of the cost among the shifts count with the smallest cost there.
     """
-    planes = real_planes(case) if real else synthetic_planes(case)
-    numbers, scan = np.unique(returns(case).scan[plane_rows(case)], return_inverse=True)
+    planes = clouds.real_planes(case) if real else clouds.synthetic_planes(case)
+    numbers, scan = np.unique(returns(case).scan[clouds.plane_rows(case)], return_inverse=True)
     known = np.isfinite(planes.normal[:, 0])
     rows = np.flatnonzero(known & (scan % 2 == 1))  # the map: no scan meets itself in it
     tree = cKDTree(planes.point[rows])

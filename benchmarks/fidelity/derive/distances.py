@@ -10,24 +10,9 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from benchmarks.fidelity.case import Case, kept_until, per_case, per_hold
-from benchmarks.fidelity.derive.beams import (
-    cast_beams,
-    cloud_tree,
-    local_at,
-    noisy_ranges,
-    points_at,
-    returns,
-    sensor_path,
-)
+from benchmarks.fidelity.derive import beams, surface
 from benchmarks.fidelity.derive.clouds import Planes, plane_rows, real_planes
 from benchmarks.fidelity.derive.curve import candidate_curve
-from benchmarks.fidelity.derive.surface import (
-    cell_numbers,
-    face_normals,
-    sample_surface,
-    surface_nearest,
-    visible_surface,
-)
 from benchmarks.fidelity.references import Hold
 
 MOST_POINTS = 120_000
@@ -58,17 +43,17 @@ class CloudDistances:
 @per_hold
 def thinned_rows(case: Case) -> Int[np.ndarray, " k"]:
     """Return the numbers of at most `MOST_POINTS` returns, evenly spaced in time."""
-    count = len(returns(case).range)
+    count = len(beams.returns(case).range)
     return np.linspace(0, count - 1, min(count, MOST_POINTS)).astype(int)
 
 
 @kept_until("CMP", per_case)
 def mesh_distances(case: Case) -> MeshDistances:
     """Return the distances of held-out points to everything visible of the candidate, without registration."""
-    pick, real = thinned_rows(case), returns(case)
+    pick, real = thinned_rows(case), beams.returns(case)
     points = real.points[pick]
-    distance, closest, face = surface_nearest(case).query(points)
-    normal = face_normals(visible_surface(case), face)
+    distance, closest, face = surface.surface_nearest(case).query(points)
+    normal = surface.face_normals(surface.visible_surface(case), face)
     side = np.einsum("ij,ij->i", normal, points - closest) * np.einsum("ij,ij->i", normal, real.origin[pick] - closest)
     local = candidate_curve(case).local(points)
     sector = np.round(np.arctan2(local[:, 2], local[:, 1]) / (2.0 * np.pi / _AXIS_SECTORS)).astype(int) % _AXIS_SECTORS
@@ -78,7 +63,7 @@ def mesh_distances(case: Case) -> MeshDistances:
 def mean_distance(case: Case, other: Hold) -> float:
     """Return the mean distance of another recording's points to the candidate, m."""
     pick = np.linspace(0, len(other.points) - 1, min(len(other.points), MOST_POINTS)).astype(int)
-    return float(surface_nearest(case).query(other.points[pick])[0].mean())
+    return float(surface.surface_nearest(case).query(other.points[pick])[0].mean())
 
 
 @per_case
@@ -88,19 +73,21 @@ def cloud_distances(case: Case) -> CloudDistances:
     A sample counts as observed if a beam hits the candidate within 5 cm of it at less than 80° of incidence; half the
     smallest tolerance, so that a return that is there is within reach of it.
     """
-    cast = cast_beams(case)
+    cast = beams.cast_beams(case)
     observed = cast.cosine > STEEPEST
-    hits = points_at(case, cast.range)[observed]
-    samples, _ = sample_surface(visible_surface(case), _MESH_CELL)
+    hits = beams.points_at(case, cast.range)[observed]
+    samples, _ = surface.sample_surface(surface.visible_surface(case), _MESH_CELL)
     samples = samples[:: max(len(samples) // (4 * MOST_POINTS), 1)]
     if not len(hits) or not len(samples):
         raise ValueError("no held-out beam meets the candidate")
     gap, _ = cKDTree(hits, balanced_tree=False).query(samples, distance_upper_bound=0.05 * case.tolerance)
     samples = samples[np.isfinite(gap)]
-    local = sensor_path(case).local(samples)
-    _, even = np.unique(cell_numbers(local, _MESH_CELL), return_index=True)  # small triangles have too many samples
+    local = beams.sensor_path(case).local(samples)
+    _, even = np.unique(
+        surface.cell_numbers(local, _MESH_CELL), return_index=True
+    )  # small triangles have too many samples
     even = even[np.linspace(0, len(even) - 1, min(len(even), MOST_POINTS)).astype(int)]
-    distance, _ = cloud_tree(case).query(samples[even])
+    distance, _ = beams.cloud_tree(case).query(samples[even])
     return CloudDistances(distance, local[even, 0])
 
 
@@ -117,9 +104,11 @@ def phantom_cells(case: Case) -> Bool[np.ndarray, " c"]:
     Cells of 10 cm stand for equal areas; beams at more than 80° of incidence do not count, for there a millimetre off
     the surface is centimetres along the beam. A beam passes through if its return lies over 15 cm behind the surface.
     """
-    cast = cast_beams(case)
+    cast = beams.cast_beams(case)
     observed = cast.cosine > STEEPEST
-    _, cell = np.unique(cell_numbers(local_at(case, cast.range)[observed], _OBSERVED_CELL), return_inverse=True)
+    _, cell = np.unique(
+        surface.cell_numbers(beams.local_at(case, cast.range)[observed], _OBSERVED_CELL), return_inverse=True
+    )
     crossed = np.bincount(cell, cast.difference[observed] < -_EARLY * case.tolerance)
     return crossed > 0.5 * np.bincount(cell)
 
@@ -136,10 +125,10 @@ def density_aware_chamfer(case: Case) -> float:
     Source: Wu et al. 2021, arXiv 2111.12702, eq. 6: ½ Σ over both of the mean of 1 - exp(-α d) / n, with n the
     number of points that share the nearest neighbour.
     """
-    edge, hit = _THIN * case.tolerance, cast_beams(case).hit
+    edge, hit = _THIN * case.tolerance, beams.cast_beams(case).hit
     clouds = [
-        points[np.unique(cell_numbers(points, edge), return_index=True)[1]]
-        for points in (returns(case).local, local_at(case, cast_beams(case).range)[hit])
+        points[np.unique(surface.cell_numbers(points, edge), return_index=True)[1]]
+        for points in (beams.returns(case).local, beams.local_at(case, beams.cast_beams(case).range)[hit])
     ]
     return 0.5 * (_one_way(clouds[0], clouds[1]) + _one_way(clouds[1], clouds[0]))
 
@@ -172,7 +161,7 @@ def _held_epoch(case: Case) -> Any:
     """Return the held-out points about a whole-metre origin, whose tree is built once for all candidates."""
     import py4dgeo
 
-    points = returns(case).points
+    points = beams.returns(case).points
     return py4dgeo.Epoch(points - np.round(points.mean(axis=0)))
 
 
@@ -188,12 +177,12 @@ def m3c2_distances(case: Case) -> M3C2Distances:
     import py4dgeo
 
     logging.getLogger("py4dgeo").setLevel(logging.WARNING)  # below that it writes a log into the working directory
-    real, cast = returns(case), cast_beams(case)
+    real, cast = beams.returns(case), beams.cast_beams(case)
     hit = cast.hit
     flat: Planes = real_planes(case)
     pick = np.linspace(0, len(flat.point) - 1, min(len(flat.point), M3C2_CORES)).astype(int)
     offset = np.round(real.points.mean(axis=0))
-    clean = points_at(case, cast.range)[hit]
+    clean = beams.points_at(case, cast.range)[hit]
     m3c2 = py4dgeo.M3C2(
         epochs=(_held_epoch(case), py4dgeo.Epoch(clean - offset)),
         corepoints=flat.point[pick] - offset,
@@ -225,12 +214,12 @@ class SelfCast:
 @per_case
 def self_cast(case: Case) -> SelfCast:
     """Casts a noisy cloud at the held-out beams and measures it against the same mesh; any mesh passes."""
-    real, cast = returns(case), cast_beams(case)
+    real, cast = beams.returns(case), beams.cast_beams(case)
     pick = thinned_rows(case)
     pick = pick[cast.hit[pick]]
     pick = pick[:: max(len(pick) // _MOST_SELF_CAST, 1)]
     reach = cast.range[pick] + PAPER_SIGMA * case.rng("selfcast").standard_normal(len(pick))
-    distance, _, _ = surface_nearest(case).query(real.origin[pick] + reach[:, None] * real.direction[pick])
+    distance, _, _ = surface.surface_nearest(case).query(real.origin[pick] + reach[:, None] * real.direction[pick])
     return SelfCast(distance, float(PAPER_SIGMA * np.sqrt(2.0 / np.pi) * np.mean(cast.cosine[pick])))
 
 
@@ -269,10 +258,10 @@ class Occupied:
 def occupied_voxels(case: Case) -> Occupied:
     """Return the voxels of held-out and synthetic points, and the known voxels near them."""
     edge = VOXEL_EDGE * case.tolerance
-    real = returns(case)
+    real = beams.returns(case)
     clouds = [_count_points(real.local, edge)]
     for draw in ("first", "second"):
-        clouds.append(_count_points(local_at(case, noisy_ranges(case, draw)), edge))
+        clouds.append(_count_points(beams.local_at(case, beams.noisy_ranges(case, draw)), edge))
     both = np.concatenate([index for index, _ in clouds[:2]])
     low, high = both.min(axis=0) - SHELL_VOXELS - 1, both.max(axis=0) + SHELL_VOXELS + 2
     points = np.stack([_fill_grid(index, count, low, high) for index, count in clouds])
@@ -284,7 +273,7 @@ def occupied_voxels(case: Case) -> Occupied:
 @per_hold
 def free_voxels(case: Case) -> Int[np.ndarray, "n 3"]:
     """Return the indices of voxels that held-out beams passed in the last metres before their returns."""
-    real = returns(case)
+    real = beams.returns(case)
     pick = np.linspace(0, len(real.range) - 1, min(len(real.range), _FREE_RAYS)).astype(int)
     edge = VOXEL_EDGE * case.tolerance
     before = np.arange(edge, _FREE_LENGTH, _BEAM_STEP)
@@ -342,7 +331,7 @@ def tolerant_f1(grids: Occupied, group: Int[np.ndarray, " i"]) -> Float[np.ndarr
 def _count_points(local: Float[np.ndarray, "n 3"], edge: float) -> tuple[Int[np.ndarray, "v 3"], Int[np.ndarray, " v"]]:
     """Return the voxels with a point near the path, and the number of their points."""
     near = local[(np.abs(local[:, 1:]) < _AROUND_PATH).all(axis=1)]
-    _, first, count = np.unique(cell_numbers(near, edge), return_index=True, return_counts=True)
+    _, first, count = np.unique(surface.cell_numbers(near, edge), return_index=True, return_counts=True)
     return np.floor(near[first] / edge).astype(np.int64), count
 
 

@@ -10,16 +10,9 @@ from scipy.spatial import cKDTree
 from skimage.measure import regionprops
 
 from benchmarks.fidelity.case import Case, per_case, per_hold, per_reference, per_truth
+from benchmarks.fidelity.derive import curve as curves
 from benchmarks.fidelity.derive.axis import hold_local, hold_points, lining_caster, reference_curve
 from benchmarks.fidelity.derive.beams import cast_beams, points_at
-from benchmarks.fidelity.derive.curve import (
-    Curve,
-    grouped_median,
-    nanmedian,
-    running_median,
-    section_angles,
-    truth_curve,
-)
 from benchmarks.fidelity.derive.sections import COLUMNS, ROW, Radii, cast_radii, truth_radii
 
 _COARSE_ROWS = 5  # rows between those that the smooth section is taken from
@@ -57,10 +50,10 @@ class Unrolled:
 
 
 def _make_map(station: np.ndarray, radius: np.ndarray, smooth: np.ndarray) -> Unrolled:
-    angle = section_angles(COLUMNS)
+    angle = curves.section_angles(COLUMNS)
     depth = radius - smooth
     depth = np.where(np.abs(depth) < _LARGEST_DEPTH, depth, np.nan)
-    typical = nanmedian(smooth.T)
+    typical = curves.nanmedian(smooth.T)
     height = typical * np.sin(angle)
     wall = np.isfinite(typical) & (height > np.nanmin(height) + _WALL_FOOT)
     return Unrolled(station, angle, depth, np.where(np.isfinite(typical), typical, np.nanmedian(typical)), wall)
@@ -68,7 +61,7 @@ def _make_map(station: np.ndarray, radius: np.ndarray, smooth: np.ndarray) -> Un
 
 def map_of_radii(radii: Radii) -> Unrolled:
     """Return a map from a table of radii; its smooth section is the running median over 1.5 m."""
-    coarse = running_median(radii.radius[::_COARSE_ROWS], _COARSE_ROWS * ROW)
+    coarse = curves.running_median(radii.radius[::_COARSE_ROWS], _COARSE_ROWS * ROW)
     return _make_map(radii.station, radii.radius, _stretch(coarse, len(radii.station), _COARSE_ROWS))
 
 
@@ -95,11 +88,11 @@ def hold_map(case: Case) -> Unrolled:
 
 
 @per_hold
-def _hold_map(case: Case, curve: Curve) -> Unrolled:
+def _hold_map(case: Case, curve: curves.Curve) -> Unrolled:
     return map_of_points(curve, hold_local(case) if case.truth is None else curve.local(hold_points(case)))
 
 
-def map_of_points(curve: Curve, local: Float[np.ndarray, "k 3"]) -> Unrolled:
+def map_of_points(curve: curves.Curve, local: Float[np.ndarray, "k 3"]) -> Unrolled:
     """Return a map from points given as station, left and up."""
     rows = max(int(curve.length / ROW), 2)
     step = curve.length / rows
@@ -110,8 +103,8 @@ def map_of_points(curve: Curve, local: Float[np.ndarray, "k 3"]) -> Unrolled:
     column = np.minimum(angle.astype(int), COLUMNS - 1)
     coarse_rows = -(-rows // _COARSE_ROWS)
     group = (row / _COARSE_ROWS).astype(int) * COLUMNS + column
-    coarse = grouped_median(group, radius, coarse_rows * COLUMNS).reshape(coarse_rows, COLUMNS)
-    coarse = running_median(coarse, _COARSE_ROWS * ROW)
+    coarse = curves.grouped_median(group, radius, coarse_rows * COLUMNS).reshape(coarse_rows, COLUMNS)
+    coarse = curves.running_median(coarse, _COARSE_ROWS * ROW)
     smooth = _stretch(coarse, rows, _COARSE_ROWS, (_COARSE_ROWS - 1) / 2)
     # Between columns the section slants: a return is compared with the section at its own angle.
     padded = np.concatenate([smooth[:, -1:], smooth, smooth[:, :1]], axis=1)
@@ -317,7 +310,7 @@ def reference_pockets(case: Case) -> Pockets:
     rows = [pocket for pocket in case.truth.furniture.get("pockets", ()) if pocket["open"]]
     if not rows:
         return Pockets(*np.zeros((4, 0)))
-    local = truth_curve(case).local(np.array([row["position"] for row in rows]) - case.truth.origin)
+    local = curves.truth_curve(case).local(np.array([row["position"] for row in rows]) - case.truth.origin)
     angle = np.arctan2(local[:, 2], local[:, 1])
     arc = reference_arc(case)[np.minimum(((angle + np.pi) / (2 * np.pi) * COLUMNS).astype(int), COLUMNS - 1)]
     depth = np.array([row["depth"] for row in rows], float)

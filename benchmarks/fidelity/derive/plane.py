@@ -9,18 +9,9 @@ from scipy.ndimage import binary_dilation, binary_erosion, binary_opening, dista
 from skimage.morphology import skeletonize
 
 from benchmarks.fidelity.case import Case, per_case
+from benchmarks.fidelity.derive import freespace
 from benchmarks.fidelity.derive.axis import hold_local, reference_curve
 from benchmarks.fidelity.derive.curve import grouped_median
-from benchmarks.fidelity.derive.freespace import (
-    KNOWN_AROUND,
-    Lattice,
-    carved_about,
-    carved_cells,
-    make_lattice,
-    object_points,
-    reachable,
-    true_object_points,
-)
 from benchmarks.fidelity.derive.sections import WIDTH_HEIGHT, lining_radii, sections, truth_caster, truth_radii, widths
 from benchmarks.fidelity.derive.surface import surface_caster
 
@@ -34,7 +25,7 @@ _SPUR = 3  # cells; pockets narrower than twice this grow no branch of the media
 class Plane:
     """Free cells of candidate and reference at the height of the sensor."""
 
-    lattice: Lattice  # Lattice of one layer
+    lattice: freespace.Lattice  # Lattice of one layer
     judged: Bool[np.ndarray, "n m"]  # judged, reference: Free cells
     reference: Bool[np.ndarray, "n m"]
     known: Bool[np.ndarray, "n m"]  # Cells that the reference knows
@@ -55,26 +46,30 @@ def sensor_height(case: Case) -> float:
 
 @per_case
 def free_plane(case: Case) -> Plane:
-    around, height = make_lattice(case, PLANE_CELL * case.tolerance), sensor_height(case)
+    around, height = freespace.make_lattice(case, PLANE_CELL * case.tolerance), sensor_height(case)
     low = np.array([around.low[0], around.low[1], height - around.edge / 2])
-    cells = Lattice(around.curve, low, (around.shape[0], around.shape[1], 1), around.edge)
+    cells = freespace.Lattice(around.curve, low, (around.shape[0], around.shape[1], 1), around.edge)
     inside = (lining_radii(case).depth(cells.points()) > 0).reshape(cells.shape[:2])
-    objects = cells.marked(cells.curve.local(object_points(case, cells.edge)))[..., 0]
-    judged = reachable(inside & ~objects)
+    objects = cells.marked(cells.curve.local(freespace.object_points(case, cells.edge)))[..., 0]
+    judged = freespace.reachable(inside & ~objects)
     if case.truth is None:
         free, known = _cells_near_plane(case, cells)
         return Plane(cells, judged, free, known, height)
     inside = (truth_radii(case).depth_local(cells.local()) > 0).reshape(cells.shape[:2])
-    free = reachable(inside & ~cells.marked(cells.curve.local(true_object_points(case, cells.edge)))[..., 0])
-    return Plane(cells, judged, free, binary_dilation(inside, iterations=int(KNOWN_AROUND / cells.edge)), height)
+    free = freespace.reachable(
+        inside & ~cells.marked(cells.curve.local(freespace.true_object_points(case, cells.edge)))[..., 0]
+    )
+    return Plane(
+        cells, judged, free, binary_dilation(inside, iterations=int(freespace.KNOWN_AROUND / cells.edge)), height
+    )
 
 
-def _cells_near_plane(case: Case, cells: Lattice) -> tuple[Bool[np.ndarray, "n m"], Bool[np.ndarray, "n m"]]:
+def _cells_near_plane(case: Case, cells: freespace.Lattice) -> tuple[Bool[np.ndarray, "n m"], Bool[np.ndarray, "n m"]]:
     """Return free and known cells by the held-out beams that run or end within 15 cm of the plane."""
     middle = cells.low[2] + cells.edge / 2
-    near = [local[np.abs(local[:, 2] - middle) < _SLAB] for local in carved_about(case, cells.curve)]
+    near = [local[np.abs(local[:, 2] - middle) < _SLAB] for local in freespace.carved_about(case, cells.curve)]
     passed, ended = (np.column_stack([local[:, :2], np.full(len(local), middle)]) for local in near)
-    free, known = carved_cells(cells, passed, ended, lambda local: np.abs(local[:, 1]))
+    free, known = freespace.carved_cells(cells, passed, ended, lambda local: np.abs(local[:, 1]))
     return free[..., 0], known[..., 0]
 
 

@@ -9,19 +9,8 @@ from scipy.ndimage import distance_transform_edt
 from scipy.signal import detrend
 
 from benchmarks.fidelity.case import Case, kept_until, per_case, per_hold, per_truth
+from benchmarks.fidelity.derive import curve as curves
 from benchmarks.fidelity.derive.axis import hold_curve, hold_local, lining_caster, lining_curve, reference_curve
-from benchmarks.fidelity.derive.curve import (
-    ROW_STEP,
-    SLICE,
-    TRACK_HALF,
-    Curve,
-    cast_profile,
-    nanmedian,
-    point_profile,
-    running_median,
-    section_angles,
-    truth_curve,
-)
 from benchmarks.fidelity.derive.surface import Caster
 
 SHELL_PARTS = ("lining", "joint", "pocket", "floor")  # parts of the truth that bound the air
@@ -55,17 +44,17 @@ def truth_bore_caster(case: Case) -> Caster:
     return Caster(case.truth.faces(*SHELL_PARTS))
 
 
-def row_stations(curve: Curve) -> Float[np.ndarray, " n"]:
+def row_stations(curve: curves.Curve) -> Float[np.ndarray, " n"]:
     """Return the stations of the rows that medians are taken over, m."""
-    return np.arange(curve.station[0] + 0.5 * ROW_STEP, curve.station[-1], ROW_STEP)
+    return np.arange(curve.station[0] + 0.5 * curves.ROW_STEP, curve.station[-1], curves.ROW_STEP)
 
 
 @per_truth
 def truth_radius_rows(case: Case) -> Float[np.ndarray, "n m"]:
     """Return smooth polar radii of the truth in 360 directions, m."""
-    curve = truth_curve(case)
-    cast = cast_profile(truth_bore_caster(case), curve, row_stations(curve), section_angles(360))
-    return running_median(cast, ROW_STEP)
+    curve = curves.truth_curve(case)
+    cast = curves.cast_profile(truth_bore_caster(case), curve, row_stations(curve), curves.section_angles(360))
+    return curves.running_median(cast, curves.ROW_STEP)
 
 
 @per_hold
@@ -73,10 +62,10 @@ def hold_radius_rows(case: Case) -> Float[np.ndarray, "n m"]:
     """Return smooth polar radii of the recording by 5 degree sector, m; NaN where too few points lie."""
     curve = hold_curve(case)
     local = hold_local(case)
-    low = (np.abs(local[:, 1]) > TRACK_HALF) & (local[:, 2] < -1.0) & (np.abs(local[:, 1]) < 2.0)
+    low = (np.abs(local[:, 1]) > curves.TRACK_HALF) & (local[:, 2] < -1.0) & (np.abs(local[:, 1]) < 2.0)
     floor = float(np.median(local[low, 2])) if low.any() else None
-    station = np.arange(curve.station[0], curve.station[-1], SLICE)
-    return running_median(point_profile(local, station, floor), SLICE)
+    station = np.arange(curve.station[0], curve.station[-1], curves.SLICE)
+    return curves.running_median(curves.point_profile(local, station, floor), curves.SLICE)
 
 
 @per_case
@@ -86,16 +75,16 @@ def sections(case: Case) -> Sections:
     Pockets and joints fall to the median over 1.5 m. Against a held-out recording the lining is measured in the same
     5 degree sectors as the points, and only sectors that they show count.
     """
-    curve, angle = reference_curve(case), section_angles(360)
-    raw = cast_profile(lining_caster(case), curve, row_stations(curve), angle)
-    cast = running_median(raw, ROW_STEP)
+    curve, angle = reference_curve(case), curves.section_angles(360)
+    raw = curves.cast_profile(lining_caster(case), curve, row_stations(curve), angle)
+    cast = curves.running_median(raw, curves.ROW_STEP)
     if case.truth is not None:
         reference, place = truth_radius_rows(case), row_stations(curve)
     else:
         reference = hold_radius_rows(case)
-        place = curve.station[0] + SLICE * np.arange(len(reference))
-        angle = section_angles(reference.shape[1])
-        cast = nanmedian(cast.reshape(len(cast), len(angle), -1))
+        place = curve.station[0] + curves.SLICE * np.arange(len(reference))
+        angle = curves.section_angles(reference.shape[1])
+        cast = curves.nanmedian(cast.reshape(len(cast), len(angle), -1))
     station = np.arange(curve.station[0] + SECTION_END, curve.station[-1] - SECTION_END + 1e-9, SECTION_STEP)
     if len(station) < 2:
         raise ValueError("the reference is too short for sections")
@@ -167,7 +156,7 @@ COLUMNS = 360
 class Radii:
     """Bore seen from its axis."""
 
-    curve: Curve  # Axis of the bore
+    curve: curves.Curve  # Axis of the bore
     station: Float[np.ndarray, " n"]  # Stations of the rows, m
     radius: Float[np.ndarray, "n m"]  # Distance to the first surface, m; NaN where there is none
     filled: Float[np.ndarray, "n m"]  # Radius with holes closed by their nearest neighbour, m
@@ -187,11 +176,11 @@ class Radii:
         return np.where(beyond > 0, -np.maximum(beyond, 1e-9), inside)
 
 
-def cast_radii(curve: Curve, caster: Caster) -> Radii:
+def cast_radii(curve: curves.Curve, caster: Caster) -> Radii:
     """Casts rays from a curve."""
     count = max(int(curve.length / ROW), 2)
     station = curve.station[0] + (np.arange(count) + 0.5) * curve.length / count
-    radius = cast_profile(caster, curve, station, section_angles(COLUMNS))
+    radius = curves.cast_profile(caster, curve, station, curves.section_angles(COLUMNS))
     if np.isfinite(radius).mean() < 0.5:
         raise ValueError("most rays from the axis leave the bore")
     return Radii(curve, station, radius, _close_holes(radius))
@@ -214,7 +203,7 @@ def lining_radii(case: Case) -> Radii:
 
 @per_truth
 def truth_radii(case: Case) -> Radii:
-    return cast_radii(truth_curve(case), truth_bore_caster(case))
+    return cast_radii(curves.truth_curve(case), truth_bore_caster(case))
 
 
 @kept_until("NAV", per_truth)

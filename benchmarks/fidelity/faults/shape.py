@@ -10,19 +10,7 @@ import trimesh
 from benchmarks.fidelity.candidate import Candidate
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.derive.curve import Curve
-from benchmarks.fidelity.faults.kinds import (
-    EVERYTHING,
-    MESHES,
-    RAILS,
-    TRACK,
-    Fault,
-    Points,
-    Site,
-    along,
-    fault_kind,
-    smooth_step,
-    warp,
-)
+from benchmarks.fidelity.faults import kinds
 from benchmarks.fidelity.faults.references import bend_recording
 from benchmarks.fidelity.faults.scene import scale_scene
 from benchmarks.fidelity.meshes import keep_bodies
@@ -34,29 +22,29 @@ _WAVE = 100.0  # m
 _SIDES = (0.0, np.pi)
 
 
-@fault_kind("wall", "one wall in or out", "m", sides=_SIDES)
-@fault_kind("roof", "roof too low or too high", "m", sides=(np.pi / 2,))
-def bulge(site: Site, fault: Fault) -> Candidate:
+@kinds.fault_kind("wall", "one wall in or out", "m", sides=_SIDES)
+@kinds.fault_kind("roof", "roof too low or too high", "m", sides=(np.pi / 2,))
+def bulge(site: kinds.Site, fault: kinds.Fault) -> Candidate:
     """Moves the part of the lining around an angle of the section."""
     way = np.array([0.0, np.cos(fault.side), np.sin(fault.side)])
 
-    def push(local: Points) -> Points:
+    def push(local: kinds.Points) -> kinds.Points:
         away = np.abs(np.angle(np.exp(1j * (np.arctan2(local[:, 2], local[:, 1]) - fault.side))))
-        near = smooth_step((_RIM - away) / (_RIM - _CORE))
+        near = kinds.smooth_step((_RIM - away) / (_RIM - _CORE))
         return (fault.size * fault.share(local[:, 0]) * near)[:, None] * way
 
     return site.moved(push, ("lining", "solid", "nails"))
 
 
-@fault_kind("floor", "floor with its track too high or too low", "m")
-def raise_floor(site: Site, fault: Fault) -> Candidate:
+@kinds.fault_kind("floor", "floor with its track too high or too low", "m")
+def raise_floor(site: kinds.Site, fault: kinds.Fault) -> Candidate:
     """Moves floor and track up; the walls above 1.3 m stay."""
     bore = site.candidate.bore
     bottom = -0.5 * float(np.median(bore.height))
 
-    def raised(local: Points) -> Points:
+    def raised(local: kinds.Points) -> kinds.Points:
         fade = np.interp(local[:, 2] - bottom, _FLOOR_RISE, [1.0, 0.0])
-        return along(2, fault.size * fault.share(local[:, 0]) * fade)
+        return kinds.along(2, fault.size * fault.share(local[:, 0]) * fade)
 
     rise = fault.size * fault.share(bore.station)
     down = np.where(np.sin(bore.angle) < -0.5, np.sin(bore.angle), 0.0)
@@ -64,28 +52,28 @@ def raise_floor(site: Site, fault: Fault) -> Candidate:
     return replace(site.moved(raised), bore=floor)
 
 
-def shift(axis: int, parts: tuple[str, ...] = EVERYTHING) -> Callable[[Site, Fault], Candidate]:
+def shift(axis: int, parts: tuple[str, ...] = kinds.EVERYTHING) -> Callable[[kinds.Site, kinds.Fault], Candidate]:
     """Return the change that moves parts to the left (axis 1) or up (2)."""
-    return lambda site, fault: site.moved(lambda local: along(axis, fault.size * fault.share(local[:, 0])), parts)
+    return lambda site, fault: site.moved(lambda local: kinds.along(axis, fault.size * fault.share(local[:, 0])), parts)
 
 
-fault_kind("aside", "everything to one side", "m")(shift(1))
-fault_kind("lift", "everything up or down", "m")(shift(2))
-fault_kind("rails", "rails floating or sunk", "m")(shift(2, RAILS))
-fault_kind("track", "track to one side of its place", "m")(shift(1, (*TRACK, "rail", "sleeper")))
+kinds.fault_kind("aside", "everything to one side", "m")(shift(1))
+kinds.fault_kind("lift", "everything up or down", "m")(shift(2))
+kinds.fault_kind("rails", "rails floating or sunk", "m")(shift(2, kinds.RAILS))
+kinds.fault_kind("track", "track to one side of its place", "m")(shift(1, (*kinds.TRACK, "rail", "sleeper")))
 
 
-@fault_kind("along", "everything along the tunnel", "m")
-def move_along(site: Site, fault: Fault) -> Candidate:
+@kinds.fault_kind("along", "everything along the tunnel", "m")
+def move_along(site: kinds.Site, fault: kinds.Fault) -> Candidate:
     """Moves everything along the tunnel; before and behind it is squeezed and stretched over `_SQUEEZE`."""
     start = fault.start or 0.0
     stations = [start - _SQUEEZE, start, start + fault.length, start + fault.length + _SQUEEZE]
-    return site.moved(lambda local: along(0, fault.size * np.interp(local[:, 0], stations, [0.0, 1.0, 1.0, 0.0])))
+    return site.moved(lambda local: kinds.along(0, fault.size * np.interp(local[:, 0], stations, [0.0, 1.0, 1.0, 0.0])))
 
 
-@fault_kind("roll", "section turned about its axis", "rad")
-def roll(site: Site, fault: Fault) -> Candidate:
-    def turned(local: Points) -> Points:
+@kinds.fault_kind("roll", "section turned about its axis", "rad")
+def roll(site: kinds.Site, fault: kinds.Fault) -> Candidate:
+    def turned(local: kinds.Points) -> kinds.Points:
         turn = fault.size * fault.share(local[:, 0])
         left = local[:, 1] * np.cos(turn) - local[:, 2] * np.sin(turn)
         up = local[:, 1] * np.sin(turn) + local[:, 2] * np.cos(turn)
@@ -94,12 +82,12 @@ def roll(site: Site, fault: Fault) -> Candidate:
     return site.moved(turned)
 
 
-@fault_kind("mirror", "left and right exchanged", signed=False)
-def mirror(site: Site, fault: Fault) -> Candidate:
-    mirrored = site.moved(lambda local: along(1, -2.0 * local[:, 1]))
+@kinds.fault_kind("mirror", "left and right exchanged", signed=False)
+def mirror(site: kinds.Site, fault: kinds.Fault) -> Candidate:
+    mirrored = site.moved(lambda local: kinds.along(1, -2.0 * local[:, 1]))
     track = mirrored.track
-    flipped: dict[str, Any] = {name: _inside_out(getattr(mirrored, name)) for name in MESHES}
-    laid: dict[str, Any] = {name: _inside_out(getattr(track, name)) for name in TRACK}
+    flipped: dict[str, Any] = {name: _inside_out(getattr(mirrored, name)) for name in kinds.MESHES}
+    laid: dict[str, Any] = {name: _inside_out(getattr(track, name)) for name in kinds.TRACK}
     turned = replace(track, rail={"left": track.rail["right"], "right": track.rail["left"]}, **laid)
     return replace(mirrored, track=turned, **flipped)
 
@@ -108,43 +96,43 @@ def _inside_out(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     return trimesh.Trimesh(mesh.vertices, mesh.faces[:, ::-1], process=False) if len(mesh.faces) else mesh
 
 
-def scale(*axes: float) -> Callable[[Site, Fault], Candidate]:
+def scale(*axes: float) -> Callable[[kinds.Site, kinds.Fault], Candidate]:
     """Return the change that scales every section about its axis: 1 for those of station, left and up that grow."""
     return lambda site, fault: site.moved(
         lambda local: fault.size * fault.share(local[:, 0])[:, None] * local * list(axes)
     )
 
 
-fault_kind("section", "sections too large, as a share of width and height")(scale(0.0, 1.0, 1.0))
-fault_kind("width", "sections too wide, as a share of the width")(scale(0.0, 1.0, 0.0))
+kinds.fault_kind("section", "sections too large, as a share of width and height")(scale(0.0, 1.0, 1.0))
+kinds.fault_kind("width", "sections too wide, as a share of the width")(scale(0.0, 1.0, 0.0))
 
 
-@fault_kind("wave", "a sideways wave of 100 m length", "m")
-def add_wave(site: Site, fault: Fault) -> Candidate:
-    return site.moved(lambda local: along(1, fault.size * np.sin(2.0 * np.pi * local[:, 0] / _WAVE)))
+@kinds.fault_kind("wave", "a sideways wave of 100 m length", "m")
+def add_wave(site: kinds.Site, fault: kinds.Fault) -> Candidate:
+    return site.moved(lambda local: kinds.along(1, fault.size * np.sin(2.0 * np.pi * local[:, 0] / _WAVE)))
 
 
 # All of the tunnel, whatever the place of the fault.
 
 
-@fault_kind("scale", "everything too large, as a share of its size")
-def scale_all(site: Site, fault: Fault) -> Candidate:
+@kinds.fault_kind("scale", "everything too large, as a share of its size")
+def scale_all(site: kinds.Site, fault: kinds.Fault) -> Candidate:
     """Scales everything about the middle of the axis, the released scene too."""
     middle, factor = site.candidate.bore.position.mean(axis=0), 1.0 + fault.size
     scene = scale_scene(site.candidate, factor, site.scratch)
-    moved = warp(site.candidate, lambda points: middle + factor * (points - middle))
+    moved = kinds.warp(site.candidate, lambda points: middle + factor * (points - middle))
     return replace(moved, folder=scene.folder, scene=scene.scene, tunnel=scene.tunnel)
 
 
-@fault_kind("yaw", "everything turned about the vertical through its middle", "rad")
-def turn_yaw(site: Site, fault: Fault) -> Candidate:
+@kinds.fault_kind("yaw", "everything turned about the vertical through its middle", "rad")
+def turn_yaw(site: kinds.Site, fault: kinds.Fault) -> Candidate:
     middle, (c, s) = site.candidate.bore.position.mean(axis=0), (np.cos(fault.size), np.sin(fault.size))
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    return warp(site.candidate, lambda points: middle + (points - middle) @ turn.T)
+    return kinds.warp(site.candidate, lambda points: middle + (points - middle) @ turn.T)
 
 
-@fault_kind("straight", "curvature missing, as a share of it", signed=False)
-def straighten(site: Site, fault: Fault) -> Candidate:
+@kinds.fault_kind("straight", "curvature missing, as a share of it", signed=False)
+def straighten(site: kinds.Site, fault: kinds.Fault) -> Candidate:
     """Moves the axis towards a straight line of the same length and mean direction; 1 leaves no curvature."""
     line = site.line
     chord = line.position[-1] - line.position[0]
@@ -152,11 +140,11 @@ def straighten(site: Site, fault: Fault) -> Candidate:
     middle = line.station - line.station.mean()
     straight = line.position.mean(axis=0) + middle[:, None] * chord
     target = Curve(line.station, (1.0 - fault.size) * line.position + fault.size * straight)
-    return warp(site.candidate, lambda points: target.point(line.local(points)))
+    return kinds.warp(site.candidate, lambda points: target.point(line.local(points)))
 
 
-@fault_kind("stretch", "mesh and recording together too long, as a share of the length")
-def stretch_axis(site: Site, fault: Fault) -> Case:
+@kinds.fault_kind("stretch", "mesh and recording together too long, as a share of the length")
+def stretch_axis(site: kinds.Site, fault: kinds.Fault) -> Case:
     """Lengthens reconstruction and recording together, as a drifting odometry does; control stays."""
     case, line, factor = site.case, site.line, 1.0 + fault.size
     middle = line.position.mean(axis=0)
@@ -166,11 +154,11 @@ def stretch_axis(site: Site, fault: Fault) -> Case:
         return longer.point(line.local(points) * [factor, 1.0, 1.0])
 
     hold, fit = (None if one is None else bend_recording(one, move) for one in (case.hold, case.fit))
-    return replace(case, candidate=warp(case.candidate, move), hold=hold, fit=fit, cache={})
+    return replace(case, candidate=kinds.warp(case.candidate, move), hold=hold, fit=fit, cache={})
 
 
-@fault_kind("short", "last part missing, as a share of the length", signed=False)
-def shorten(site: Site, fault: Fault) -> Candidate:
+@kinds.fault_kind("short", "last part missing, as a share of the length", signed=False)
+def shorten(site: kinds.Site, fault: kinds.Fault) -> Candidate:
     candidate, line = site.candidate, site.line
     bore, track, end = candidate.bore, candidate.track, candidate.length * (1.0 - fault.size)
     position, tangent, *_ = line.frames(np.array([end]))
@@ -189,7 +177,7 @@ def shorten(site: Site, fault: Fault) -> Candidate:
         pocket=bore.pocket[bore.pocket["station"] <= end] if len(bore.pocket) else bore.pocket,
     )  # fmt: skip
     rail = {side: points[line.local(points)[:, 0] <= end] for side, points in track.rail.items() if len(points)}
-    laid: dict[str, Any] = {name: before(getattr(track, name)) for name in TRACK}
+    laid: dict[str, Any] = {name: before(getattr(track, name)) for name in kinds.TRACK}
     if len(track.sleeper):
         laid["sleeper"] = track.sleeper[line.local(track.sleeper)[:, 0] <= end]
     welded = candidate.solid.copy()

@@ -5,49 +5,31 @@ from pathlib import Path
 import matplotlib
 import matplotlib.pyplot as plt
 
-from benchmarks.fidelity.figures.errors import (
-    draw_depth_maps,
-    draw_error_distribution,
-    draw_errors_along,
-    draw_mismatch,
-    draw_projections,
-    draw_sections,
-    draw_signed_errors,
-)
+from benchmarks.fidelity.figures import errors, tunnel
 from benchmarks.fidelity.figures.sheet import Draw, Sheet, draw_categories, draw_controls, draw_sweep
-from benchmarks.fidelity.figures.tunnel import (
-    draw_axis,
-    draw_degeneracy,
-    draw_free_space,
-    draw_persistence,
-    draw_range_image,
-    draw_sensor_distributions,
-    draw_unrolled,
-    draw_worst_places,
-)
 from benchmarks.fidelity.table import Need
 
 matplotlib.use("Agg")
 
 FIGURES: tuple[tuple[str, Draw, Need | None], ...] = (  # with the reference that each cannot do without
-    ("F17-unrolled", draw_unrolled, "reference"),
-    ("F18-worst-places", draw_worst_places, "reference"),
+    ("F17-unrolled", tunnel.draw_unrolled, "reference"),
+    ("F18-worst-places", tunnel.draw_worst_places, "reference"),
     ("F13-categories", draw_categories, None),
     ("F14-controls", draw_controls, None),
     ("F15-sweep", draw_sweep, None),
-    ("F01-voxels", draw_projections, "hold"),
-    ("F02-mismatch", draw_mismatch, "hold"),
-    ("F03-signed-error", draw_signed_errors, "hold"),
-    ("F04-along-chainage", draw_errors_along, "hold"),
-    ("F05-sections", draw_sections, "reference"),
-    ("F06-depth-maps", draw_depth_maps, "hold"),
-    ("F07-distribution", draw_error_distribution, "hold"),
-    ("F08-range-image", draw_range_image, "hold"),
-    ("F09-sensor", draw_sensor_distributions, "hold"),
-    ("F10-persistence", draw_persistence, "reference"),
-    ("F11-free-space", draw_free_space, "reference"),
-    ("F12-degeneracy", draw_degeneracy, "hold"),
-    ("F16-axis", draw_axis, "reference"),
+    ("F01-voxels", errors.draw_projections, "hold"),
+    ("F02-mismatch", errors.draw_mismatch, "hold"),
+    ("F03-signed-error", errors.draw_signed_errors, "hold"),
+    ("F04-along-chainage", errors.draw_errors_along, "hold"),
+    ("F05-sections", errors.draw_sections, "reference"),
+    ("F06-depth-maps", errors.draw_depth_maps, "hold"),
+    ("F07-distribution", errors.draw_error_distribution, "hold"),
+    ("F08-range-image", tunnel.draw_range_image, "hold"),
+    ("F09-sensor", tunnel.draw_sensor_distributions, "hold"),
+    ("F10-persistence", tunnel.draw_persistence, "reference"),
+    ("F11-free-space", tunnel.draw_free_space, "reference"),
+    ("F12-degeneracy", tunnel.draw_degeneracy, "hold"),
+    ("F16-axis", tunnel.draw_axis, "reference"),
 )
 
 

@@ -6,15 +6,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from benchmarks.fidelity.case import Case, kept_until, per_case, per_hold, per_truth
+from benchmarks.fidelity.derive import curve as curves
 from benchmarks.fidelity.derive.beams import cast_beams, observed_extent, returns, sensor_path
-from benchmarks.fidelity.derive.curve import (
-    Curve,
-    cast_profile,
-    grouped_median,
-    nanmedian,
-    section_angles,
-    truth_curve,
-)
 from benchmarks.fidelity.derive.sections import truth_bore_caster
 from benchmarks.fidelity.derive.surface import Caster, visible_parts
 from benchmarks.fidelity.meshes import concatenate_meshes
@@ -25,7 +18,7 @@ CAP = 0.5  # m; larger offsets count as this
 LEAST = 4  # returns that make a cell known
 FINE = 0.05  # m along the tunnel between rays of a relief
 COLUMNS = 216  # rays of a relief around the tunnel
-ANGLES = section_angles(COLUMNS)
+ANGLES = curves.section_angles(COLUMNS)
 TRACK = ("sleeper", "rail", "fastening")  # parts of a candidate that are no bore
 TRACK_SIDE = np.deg2rad(50.0)  # from straight down: what lies there may be track
 _STEEPEST = np.cos(np.deg2rad(80.0))  # beams that graze more steeply say little about where a surface is
@@ -37,7 +30,7 @@ _MOUTH = 0.5  # m at the mouths that the truth's rays leave out
 class Unrolled:
     """Radius of the reference about the middle of its section, and what the candidate's surface lies beyond it."""
 
-    curve: Curve  # Curve that stations count along
+    curve: curves.Curve  # Curve that stations count along
     middle: tuple[float, float]  # Middle of the section to the left of and above the curve, m
     low: float  # Station where the first cells begin, m
     radius: Float[np.ndarray, "n m"]  # Median radius of the reference, m; NaN where it is not known
@@ -122,7 +115,7 @@ def hold_map(case: Case) -> Unrolled:
     off_track &= (free >= _BORE * count)[frame.cell]
 
     def medians(rows: np.ndarray, values: np.ndarray) -> np.ndarray:
-        return grouped_median(frame.cell[rows], values[rows], shape[0] * shape[1], LEAST).reshape(shape)
+        return curves.grouped_median(frame.cell[rows], values[rows], shape[0] * shape[1], LEAST).reshape(shape)
 
     known = inside & off_track
     radius = medians(known, np.hypot(frame.local[:, 1], frame.local[:, 2]))
@@ -149,22 +142,22 @@ def bore_caster(case: Case) -> Caster:
 
 @per_truth
 def truth_relief(case: Case) -> Relief:
-    curve = truth_curve(case)
+    curve = curves.truth_curve(case)
     stations = np.arange(_MOUTH + FINE / 2, curve.length - _MOUTH, FINE)
-    return Relief(stations, cast_profile(truth_bore_caster(case), curve, stations, ANGLES))
+    return Relief(stations, curves.cast_profile(truth_bore_caster(case), curve, stations, ANGLES))
 
 
 @per_case
 def relief_on_truth(case: Case) -> Relief:
     stations = truth_relief(case).station
-    return Relief(stations, cast_profile(bore_caster(case), truth_curve(case), stations, ANGLES))
+    return Relief(stations, curves.cast_profile(bore_caster(case), curves.truth_curve(case), stations, ANGLES))
 
 
 @per_case
 def relief_on_path(case: Case) -> Relief:
     frame = hold_frame(case)
     stations = np.arange(frame.low + FINE / 2, frame.high, FINE)
-    return Relief(stations, cast_profile(bore_caster(case), sensor_path(case), stations, ANGLES, frame.middle))
+    return Relief(stations, curves.cast_profile(bore_caster(case), sensor_path(case), stations, ANGLES, frame.middle))
 
 
 def relief_cells(relief: Relief, values: Float[np.ndarray, "n m"] | None = None) -> Float[np.ndarray, "k s"]:
@@ -173,7 +166,7 @@ def relief_cells(relief: Relief, values: Float[np.ndarray, "n m"] | None = None)
     grid = relief.radius if values is None else values
     count = len(grid) // rows
     blocks = grid[: count * rows].reshape(count, rows, SECTORS, columns)
-    return nanmedian(blocks.transpose(0, 2, 1, 3).reshape(count, SECTORS, -1))
+    return curves.nanmedian(blocks.transpose(0, 2, 1, 3).reshape(count, SECTORS, -1))
 
 
 @per_case
@@ -182,4 +175,4 @@ def truth_map(case: Case) -> Unrolled:
     offset = np.where(np.isfinite(judged.radius), judged.radius - real.radius, CAP)
     offset = np.where(np.isfinite(real.radius), np.clip(offset, -CAP, CAP), np.nan)
     low = float(real.station[0]) - FINE / 2
-    return Unrolled(truth_curve(case), (0.0, 0.0), low, relief_cells(real), relief_cells(real, offset))
+    return Unrolled(curves.truth_curve(case), (0.0, 0.0), low, relief_cells(real), relief_cells(real, offset))

@@ -10,17 +10,7 @@ from benchmarks.fidelity.derive.curve import candidate_curve
 from benchmarks.fidelity.faults import put_in
 from benchmarks.fidelity.faults.kinds import local_site
 from benchmarks.fidelity.faults.rows import stated_faults
-from benchmarks.fidelity.windows.measures import (
-    MEASURES,
-    STANDARD_SENSOR,
-    Measure,
-    Series,
-    Source,
-    limits,
-    sensor_of,
-    sources,
-    unrolled,
-)
+from benchmarks.fidelity.windows import measures
 
 
 @dataclass(frozen=True)
@@ -29,7 +19,7 @@ class Worst:
 
     id: str  # Measure
     words: str  # Measure for people
-    source: Source  # `recording` or `truth`
+    source: measures.Source  # `recording` or `truth`
     unit: str  # Unit of value and limit
     value: float | None  # Value there; `None` where nothing could be judged
     limit: float  # Largest value that passes
@@ -64,13 +54,13 @@ class Worst:
 
 def worst_windows(case: Case) -> list[Worst]:
     """Return the worst window of every measure against every reference of the case; empty without a reference."""
-    return [_worst(case, one, source) for source in sources(case) for one in MEASURES]
+    return [_worst(case, one, source) for source in measures.sources(case) for one in measures.MEASURES]
 
 
-def _worst(case: Case, one: Measure, source: Source) -> Worst:
+def _worst(case: Case, one: measures.Measure, source: measures.Source) -> Worst:
     topic = case.hold.sensor if source == "recording" and case.hold is not None else ""
-    sensor = sensor_of(topic) if topic else STANDARD_SENSOR
-    limit = limits(sensor or STANDARD_SENSOR)[f"{one.id}.{source}"]
+    sensor = measures.sensor_of(topic) if topic else measures.STANDARD_SENSOR
+    limit = measures.limits(sensor or measures.STANDARD_SENSOR)[f"{one.id}.{source}"]
     nothing = Worst(one.id, one.words, source, one.unit, None, one.gate)
     if limit is None:
         return nothing
@@ -87,9 +77,9 @@ def _worst(case: Case, one: Measure, source: Source) -> Worst:
     return replace(nothing, start=start, end=end, **found)
 
 
-def stations_on_candidate(case: Case, source: Source, series: Series, k: int) -> tuple[float, float]:
+def stations_on_candidate(case: Case, source: measures.Source, series: measures.Series, k: int) -> tuple[float, float]:
     """Return start and end of a window as stations of the candidate's centreline, the smaller first, m."""
-    one = unrolled(case, source)
+    one = measures.unrolled(case, source)
     ends = np.array([one.place(series.start[k]), one.place(series.start[k] + series.window)])
     low, high = np.sort(candidate_curve(case).local(ends)[:, 0])
     return float(np.clip(low, 0.0, case.candidate.length)), float(np.clip(high, 0.0, case.candidate.length))
@@ -115,7 +105,7 @@ def notice_faults(case: Case, before: list[Worst]) -> list[Noticed]:
         case: Case of the candidate as it is.
         before: Its worst windows.
     """
-    if not sources(case):
+    if not measures.sources(case):
         return []
     site, judged = local_site(case), {f"{one.id}.{one.source}" for one in before if one.value is not None}
     result = []

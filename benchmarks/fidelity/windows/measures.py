@@ -13,17 +13,7 @@ from jaxtyping import Float
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.derive.curve import section_angles
 from benchmarks.fidelity.registry import mean_absolute, rms
-from benchmarks.fidelity.windows import track
-from benchmarks.fidelity.windows.deviation import (
-    CELL,
-    SECTORS,
-    Unrolled,
-    hold_map,
-    relief_cells,
-    relief_on_path,
-    relief_on_truth,
-    truth_map,
-)
+from benchmarks.fidelity.windows import deviation, track
 from benchmarks.fidelity.windows.shift import handedness, hold_shift, truth_shift
 from benchmarks.fidelity.windows.track import Profile
 
@@ -67,33 +57,35 @@ class Measure:
     compute: Callable[[Case, Source], Series]  # Function from case and source to values
 
 
-def unrolled(case: Case, source: Source) -> Unrolled:
+def unrolled(case: Case, source: Source) -> deviation.Unrolled:
     """Return the map of deviations against the held-out recording or the truth."""
-    return hold_map(case) if source == "recording" else truth_map(case)
+    return deviation.hold_map(case) if source == "recording" else deviation.truth_map(case)
 
 
 def _by_cells(
     statistic: Callable[[Float[np.ndarray, "k m"]], tuple[float, str]],
 ) -> Callable[[Case, Source], Series]:
     def compute(case: Case, source: Source) -> Series:
-        one, rows = unrolled(case, source), round(SHORT / CELL)
-        firsts = np.arange(0, max(len(one.offset) - rows, 0) + 1, round(STEP / CELL))  # one window where it is longer
+        one, rows = unrolled(case, source), round(SHORT / deviation.CELL)
+        firsts = np.arange(
+            0, max(len(one.offset) - rows, 0) + 1, round(STEP / deviation.CELL)
+        )  # one window where it is longer
         windows = [one.offset[row : row + rows] for row in firsts]
         found = [statistic(w) if np.isfinite(w).mean() >= _LEAST_CELLS else (np.nan, "") for w in windows]
         values, places = zip(*found, strict=True)
-        return Series(one.low + firsts * CELL, np.asarray(values, float), places, SHORT)
+        return Series(one.low + firsts * deviation.CELL, np.asarray(values, float), places, SHORT)
 
     return compute
 
 
 def _worst_spot(cells: np.ndarray) -> tuple[float, str]:
     worst = np.unravel_index(np.nanargmax(np.abs(cells)), cells.shape)
-    octant = int(np.round(section_angles(SECTORS)[worst[1]] / (np.pi / 4))) % 8
+    octant = int(np.round(section_angles(deviation.SECTORS)[worst[1]] / (np.pi / 4))) % 8
     return abs(float(cells[worst])), PLACES[octant]
 
 
 def _worst_sector(cells: np.ndarray) -> tuple[float, str]:
-    octant = np.round(section_angles(SECTORS) / (np.pi / 4)).astype(int) % 8
+    octant = np.round(section_angles(deviation.SECTORS) / (np.pi / 4)).astype(int) % 8
     means = []
     for k in range(8):
         part = cells[:, octant == k]
@@ -119,7 +111,7 @@ def _moved(direction: Float[np.ndarray, " m"]) -> Callable[[np.ndarray], tuple[f
 
 def _shift(case: Case, source: Source) -> Series:
     one = unrolled(case, source)
-    length = len(one.offset) * CELL
+    length = len(one.offset) * deviation.CELL
     starts = one.low + np.arange(0.0, max(length - LONG, 0.0) + 1e-6, STEP)
     found = (hold_shift if source == "recording" else truth_shift)(case, starts, LONG)
     return Series(starts, np.abs(found), ("",) * len(starts), LONG)
@@ -127,14 +119,16 @@ def _shift(case: Case, source: Source) -> Series:
 
 def _hand(case: Case, source: Source) -> Series:
     one = unrolled(case, source)
-    relief = relief_on_path(case) if source == "recording" else relief_on_truth(case)
-    judged = relief_cells(relief)
+    relief = deviation.relief_on_path(case) if source == "recording" else deviation.relief_on_truth(case)
+    judged = deviation.relief_cells(relief)
     count = min(len(judged), len(one.radius))
-    rows, step = min(round(HAND / CELL), count), round(HAND / 3 / CELL)
+    rows, step = min(round(HAND / deviation.CELL), count), round(HAND / 3 / deviation.CELL)
     firsts = np.arange(0, max(count - rows, 0) + 1, step)
     pairs = [handedness(one.radius[k : k + rows], judged[k : k + rows]) for k in firsts]
     values = [np.nan if size < _FAINT else 1.0 - agreement for agreement, size in pairs]
-    return Series(one.low + firsts * CELL, np.asarray(values, float), ("",) * len(firsts), rows * CELL)
+    return Series(
+        one.low + firsts * deviation.CELL, np.asarray(values, float), ("",) * len(firsts), rows * deviation.CELL
+    )
 
 
 def _by_profile(
@@ -165,7 +159,7 @@ def _gauge_change(case: Case) -> Profile:
     return Profile(profile.station, profile.value - np.median(profile.value)) if len(profile.value) else profile
 
 
-_ANGLE = section_angles(SECTORS)
+_ANGLE = section_angles(deviation.SECTORS)
 MEASURES = tuple(Measure(*row) for row in (
     ("wall", "mean distance of the walls", "m", 0.02, 0.05,
      _by_cells(lambda cells: (float(np.nanmean(np.abs(cells))), ""))),
@@ -174,7 +168,8 @@ MEASURES = tuple(Measure(*row) for row in (
     ("lift", "section moved up or down", "m", 0.03, 0.05, _by_cells(_moved(np.sin(_ANGLE)))),
     ("cells", f"share of the surface more than {100 * OFF_CELL:g} cm off", "1", 0.02, 0.2,
      _by_cells(lambda cells: (float(np.mean(np.abs(cells[np.isfinite(cells)]) > OFF_CELL)), ""))),
-    ("spot", f"one spot of {CELL:g} m by {360 // SECTORS:d} degrees", "m", 0.08, 0.3, _by_cells(_worst_spot)),
+    ("spot", f"one spot of {deviation.CELL:g} m by {360 // deviation.SECTORS:d} degrees", "m", 0.08, 0.3,
+     _by_cells(_worst_spot)),
     ("shift", "relief of the walls moved along the tunnel", "m", 0.08, 0.15, _shift),
     ("hand", "left and right exchanged (0 not, 2 mirrored)", "1", 1.2, 1.2, _hand),
     ("gauge", "error of the gauge", "m", 0.004, 0.006, _by_profile(track.true_gauge_error, None, np.mean, LONG, 8)),

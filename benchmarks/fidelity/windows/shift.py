@@ -5,21 +5,10 @@ from jaxtyping import Float, Int
 
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.derive.curve import nanmedian, section_angles
-from benchmarks.fidelity.windows.deviation import (
-    COLUMNS,
-    FINE,
-    SECTORS,
-    Relief,
-    hold_frame,
-    is_floor,
-    parts_hit,
-    relief_on_path,
-    relief_on_truth,
-    truth_relief,
-)
+from benchmarks.fidelity.windows import deviation
 
 REACH = 0.40  # m; largest shift that is looked for: a quarter of a ring, so that the next one is not taken for it
-_STEPS = round(REACH / FINE)  # shifts that are tried to either side, `FINE` apart
+_STEPS = round(REACH / deviation.FINE)  # shifts that are tried to either side, `FINE` apart
 _DEEPEST = 0.10  # m; larger differences count as this
 _LEAST_CONTRAST = 0.0008  # m that the best shift must fit better than a wrong one
 _POINTS = 20_000
@@ -31,7 +20,7 @@ def shift_by_window(
     station: Float[np.ndarray, " n"],
     angle: Float[np.ndarray, " n"],
     radius: Float[np.ndarray, " n"],
-    judged: Relief,
+    judged: deviation.Relief,
     starts: Float[np.ndarray, " k"],
     window: float,
 ) -> Float[np.ndarray, " k"]:
@@ -51,8 +40,8 @@ def shift_by_window(
     order = np.argsort(station, kind="stable")
     station, radius = station[order], radius[order]
     turn = (angle[order] + np.pi) / (2.0 * np.pi)
-    sector = (turn * SECTORS).astype(int) % SECTORS
-    padded, cell = _cells_of(station, (turn * COLUMNS).astype(int) % COLUMNS, judged)
+    sector = (turn * deviation.SECTORS).astype(int) % deviation.SECTORS
+    padded, cell = _cells_of(station, (turn * deviation.COLUMNS).astype(int) % deviation.COLUMNS, judged)
     steps = np.arange(-_STEPS, _STEPS + 1)
     result = np.full(len(starts), np.nan)
     for k, (first, last) in enumerate(np.searchsorted(station, [starts, starts + window]).T):
@@ -63,22 +52,22 @@ def shift_by_window(
         best = int(np.argmin(errors))
         if not 0 < best < len(steps) - 1 or np.median(errors) - errors[best] < _LEAST_CONTRAST:
             continue
-        result[k] = steps[best] * FINE + _vertex(errors, best)
+        result[k] = steps[best] * deviation.FINE + _vertex(errors, best)
     return result
 
 
 def _cells_of(
-    station: Float[np.ndarray, " n"], column: Int[np.ndarray, " n"], judged: Relief
+    station: Float[np.ndarray, " n"], column: Int[np.ndarray, " n"], judged: deviation.Relief
 ) -> tuple[Float[np.ndarray, " c"], Int[np.ndarray, " n"]]:
     """Return the radii of a relief in one row, NaN before and behind it, and the place of each point in them.
 
     A point that moves by one step lies `COLUMNS` places on: all shifts of a window read the same places.
     """
-    beyond = np.full((2 * _STEPS + 1, COLUMNS), np.nan)
+    beyond = np.full((2 * _STEPS + 1, deviation.COLUMNS), np.nan)
     padded = np.concatenate([beyond, judged.radius, beyond])
-    row = np.round((station - judged.station[0]) / FINE).astype(int)
+    row = np.round((station - judged.station[0]) / deviation.FINE).astype(int)
     row = np.clip(row, -_STEPS - 1, len(judged.station) + _STEPS) + len(beyond)
-    return padded.ravel(), row * COLUMNS + column
+    return padded.ravel(), row * deviation.COLUMNS + column
 
 
 def _misfits(
@@ -96,8 +85,8 @@ def _misfits(
     slope = lines[1][2][sector]
     errors = np.full(len(steps), np.nan)
     for k, step in enumerate(steps):
-        gap = judged[cell + step * COLUMNS]
-        np.subtract(apart + slope * (step * FINE), gap, out=gap)
+        gap = judged[cell + step * deviation.COLUMNS]
+        np.subtract(apart + slope * (step * deviation.FINE), gap, out=gap)
         unknown = int(np.count_nonzero(np.isnan(gap)))
         if unknown < len(gap):
             total = np.fmin(np.abs(gap, out=gap), _DEEPEST, out=gap).sum()  # what is unknown counts as `_DEEPEST` here
@@ -109,12 +98,12 @@ def _line_by_sector(
     station: np.ndarray, values: np.ndarray, sector: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Fits a straight line along the tunnel in each direction: mean station, mean value and slope."""
-    count = np.maximum(np.bincount(sector, minlength=SECTORS), 1)
-    middle = np.bincount(sector, station, SECTORS) / count
-    level = np.bincount(sector, values, SECTORS) / count
+    count = np.maximum(np.bincount(sector, minlength=deviation.SECTORS), 1)
+    middle = np.bincount(sector, station, deviation.SECTORS) / count
+    level = np.bincount(sector, values, deviation.SECTORS) / count
     off = station - middle[sector]
-    spread = np.bincount(sector, off**2, SECTORS)
-    slope = np.bincount(sector, off * (values - level[sector]), SECTORS) / np.maximum(spread, 1e-9)
+    spread = np.bincount(sector, off**2, deviation.SECTORS)
+    slope = np.bincount(sector, off * (values - level[sector]), deviation.SECTORS) / np.maximum(spread, 1e-9)
     return middle, level, slope
 
 
@@ -129,27 +118,29 @@ def _vertex(errors: np.ndarray, best: int) -> float:
     """Return the place of the least error beside the best shift, m, by a parabola."""
     before, here, after = errors[best - 1 : best + 2]
     bend = before - 2.0 * here + after
-    return float(np.clip(0.5 * (before - after) / bend, -0.5, 0.5) * FINE) if bend > 0.0 else 0.0
+    return float(np.clip(0.5 * (before - after) / bend, -0.5, 0.5) * deviation.FINE) if bend > 0.0 else 0.0
 
 
 def hold_shift(case: Case, starts: Float[np.ndarray, " k"], window: float) -> Float[np.ndarray, " k"]:
     """Return the shift of the candidate against the held-out returns on its walls, m; ahead positive."""
-    frame = hold_frame(case)
-    wall = (frame.cell >= 0) & ~is_floor(frame.angle) & np.isin(parts_hit(case), ("lining", "nail"))
+    frame = deviation.hold_frame(case)
+    wall = (frame.cell >= 0) & ~deviation.is_floor(frame.angle) & np.isin(deviation.parts_hit(case), ("lining", "nail"))
     local = frame.local[wall]
     radius = np.hypot(local[:, 1], local[:, 2])
-    return shift_by_window(local[:, 0], frame.angle[wall], radius, relief_on_path(case), starts, window)
+    return shift_by_window(local[:, 0], frame.angle[wall], radius, deviation.relief_on_path(case), starts, window)
 
 
 def truth_shift(case: Case, starts: Float[np.ndarray, " k"], window: float) -> Float[np.ndarray, " k"]:
     """Return the shift of the candidate against the truth, m; ahead positive."""
-    real = truth_relief(case)
-    angle = section_angles(COLUMNS)
-    wall = ~is_floor(angle)
+    real = deviation.truth_relief(case)
+    angle = section_angles(deviation.COLUMNS)
+    wall = ~deviation.is_floor(angle)
     station, around = np.meshgrid(real.station, angle[wall], indexing="ij")
     radius = real.radius[:, wall]
     known = np.isfinite(radius)
-    return shift_by_window(station[known], around[known], radius[known], relief_on_truth(case), starts, window)
+    return shift_by_window(
+        station[known], around[known], radius[known], deviation.relief_on_truth(case), starts, window
+    )
 
 
 def handedness(reference: Float[np.ndarray, "n m"], judged: Float[np.ndarray, "n m"]) -> tuple[float, float]:
@@ -171,8 +162,8 @@ def handedness(reference: Float[np.ndarray, "n m"], judged: Float[np.ndarray, "n
 
 def _one_sided(radius: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n h"]:
     """Return half the difference of left and right by cell, without each row's shift and each direction's median."""
-    angle = section_angles(SECTORS)
-    left = np.flatnonzero((np.abs(angle) < np.pi / 2) & ~is_floor(angle))
+    angle = section_angles(deviation.SECTORS)
+    left = np.flatnonzero((np.abs(angle) < np.pi / 2) & ~deviation.is_floor(angle))
     mirror = np.argmin(np.abs(np.angle(np.exp(1j * (angle[None] - (np.pi - angle[left])[:, None])))), axis=1)
     half = (radius[:, left] - radius[:, mirror]) / 2.0
     template = _shift_template(nanmedian(radius.T), angle)[left]

@@ -57,7 +57,7 @@ def test_a_scan_near_the_cut_counts_by_the_probability_that_it_lies_beyond(monke
     deviation, weakest = 0.05, np.full((20, 3), 1.0)  # of log10
     scans = {real: SimpleNamespace(axial=np.full(20, 10.0 ** (sign * deviation) / 10.0), translation=weakest)
              for real, sign in ((True, 1.0), (False, -1.0))}  # fmt: skip
-    monkeypatch.setattr(sensor, "information", lambda case, real: scans[real])
+    monkeypatch.setattr(sensor.degeneracy, "information", lambda case, real: scans[real])
     assert sensor.deg_landmark_diff(None).value == pytest.approx(100.0 * (0.8413 - 0.1587), abs=0.01)
 
 
