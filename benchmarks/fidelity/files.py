@@ -8,6 +8,7 @@ from typing import Any
 
 from scene.resume import input_record
 from subterra_jax.host.errors import SubterraError
+from subterra_jax.host.files import replace_file
 
 
 class FidelityError(SubterraError):
@@ -20,18 +21,8 @@ def file_hash(path: Path) -> str:
 
 
 def write_text(path: Path, text: str) -> Path:
-    """Writes a file under a temporary name and renames it.
-
-    Raises:
-        FidelityError: It cannot be written there.
-    """
-    fresh = path.with_name(f".{path.name}.partial")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with replace_file(path) as fresh:
         fresh.write_text(text)
-        fresh.replace(path)
-    except OSError as error:
-        raise FidelityError(f"{path}: cannot be written ({error.strerror})") from error
     return path
 
 

@@ -1,9 +1,7 @@
 """The report as plain data, and all its forms: JSON, CSV, HTML, Markdown, JUnit, figures."""
 
 import platform
-import subprocess
 from dataclasses import asdict, replace
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +21,7 @@ from benchmarks.fidelity.report import forms
 from benchmarks.fidelity.scoring import Score, Scored
 from benchmarks.fidelity.table import Metric
 from benchmarks.fidelity.windows.judge import dump_windows
+from benchmarks.results import commit, version
 
 SOURCE = "Subterra: An Open-Source Validated Benchmark for GNSS-Denied Tunnel Navigation"
 
@@ -107,8 +106,8 @@ def report_content(
         "seed": inputs.seed,
         "constants": judge.constants_digest(),
         "code_hash": code_hash(),
-        "commit": _commit(),
-        "versions": _versions(),
+        "commit": commit(),
+        "versions": {"python": platform.python_version()} | {one: version(one) or "not installed" for one in VERSIONS},
         "config": asdict(inputs.hold),
         "paper": paper_rows(judgement),
         "categories": _category_entries(judgement.scored),
@@ -214,22 +213,6 @@ def _split_entry(case: Case, inputs: Inputs) -> dict[str, Any]:
         "truth": None if case.truth is None else "generator",
         "rule": "cross-sensor" if hold is not None and case.fit is not None else "as given",
     }  # fmt: skip
-
-
-def _versions() -> dict[str, str]:
-    versions = {"python": platform.python_version()}
-    for name in VERSIONS:
-        try:
-            versions[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            versions[name] = "not installed"
-    return versions
-
-
-def _commit() -> str | None:
-    here = Path(__file__).parent
-    done = subprocess.run(["git", "-C", str(here), "rev-parse", "HEAD"], capture_output=True, text=True)
-    return done.stdout.strip() or None
 
 
 def write_report(
