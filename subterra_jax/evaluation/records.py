@@ -94,12 +94,6 @@ class Records:
 
         return {field.name: plain(getattr(self, field.name)) for field in dataclasses.fields(self)}
 
-    @classmethod
-    def from_columns(cls, columns: dict[str, list[Any]]) -> "Records":
-        """Make records of the lists of `as_columns`."""
-        kinds = {"success": bool, "contact": bool, "seed": np.uint32, "tunnel": int, "severity": int, "group": int}
-        return cls(**{name: np.array(values, kinds.get(name, float)) for name, values in columns.items()})
-
 
 def make_records(tally: Any, episodes: Episodes, env: TunnelEnv, params: EnvParams) -> Records:
     """Make records of the `Tally` of finished episodes, fetched to the host."""

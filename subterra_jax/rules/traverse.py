@@ -5,11 +5,11 @@ from typing import Any, ClassVar
 
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from subterra_jax import constants
 from subterra_jax.parts.part import Step
-from subterra_jax.rules.rule import Rule, Terms, Verdict, jerk
+from subterra_jax.rules.rule import Rule, Verdict, jerk
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel import Tunnel
 
@@ -44,50 +44,15 @@ class Traverse(Rule):
     def judge(self, step: Step, params: EnvParams) -> Verdict:
         coverage = jnp.clip(step.furthest / step.tunnel.length, 0.0, 1.0)
         success = (coverage >= params.goal_coverage) & ~step.contact
-        terms = reward_terms(
-            success=success,
-            newly_covered=step.furthest - step.before.furthest,
-            length=step.tunnel.length,
-            lateral=step.place.lateral,
-            half_width=step.place.half_width,
-            command=step.command,
-            previous=step.before.command,
-            params=params.reward,
-        )
+        weights, place, before = params.reward, step.place, step.before
+        newly_covered = step.furthest - before.furthest  # m; 0 on ground covered before
+        terms = {
+            "reward_terminal": weights.terminal * success.astype(newly_covered.dtype),
+            "reward_coverage": weights.coverage * newly_covered / step.tunnel.length,
+            "reward_lateral": -weights.lateral * jnp.abs(place.lateral) / place.half_width,
+            "reward_jerk": -weights.jerk * jerk(step.command, before.command),
+        }
         return Verdict(success, success, terms)
 
     def shortest_way(self, state: State, tunnel: Tunnel, params: EnvParams) -> Float[Array, ""]:
         return params.goal_coverage * tunnel.length - state.station
-
-
-def reward_terms(
-    *,
-    success: Bool[Array, ""],
-    newly_covered: Float[Array, ""],
-    length: Float[Array, ""],
-    lateral: Float[Array, ""],
-    half_width: Float[Array, ""],
-    command: Float[Array, "2"],
-    previous: Float[Array, "2"],
-    params: RewardParams,
-) -> Terms:
-    """Return the terms of one step's reward; the reward is their sum.
-
-    Args:
-        success: The task was achieved at this step.
-        newly_covered: Arc length beyond the furthest station so far, m; 0 on ground covered before.
-        length: Length of the tunnel, m.
-        lateral: Distance to the left of the centreline, m.
-        half_width: Half the local width, m.
-        command: Speed (m/s) and yaw rate (rad/s) of this step, after clipping.
-        previous: Command of the step before; zeros at the start of an episode.
-        params: Weights.
-
-    Source: paper, Eq. 1.
-    """
-    return {
-        "reward_terminal": params.terminal * success.astype(newly_covered.dtype),
-        "reward_coverage": params.coverage * newly_covered / length,
-        "reward_lateral": -params.lateral * jnp.abs(lateral) / half_width,
-        "reward_jerk": -params.jerk * jerk(command, previous),
-    }

@@ -173,11 +173,6 @@ class Library:
         return self._folder / Path(name).name
 
 
-def cut_piece(plan: TunnelPlan, length: float) -> TunnelPlan:
-    """Return the first `length` metres of a tunnel, or the whole."""
-    return plan if length >= plan.length - 1e-6 or not np.isfinite(length) else plan.slice(0.0, length)
-
-
 class TunnelView:
     """Shows one tunnel at a time: its plan or lining at once, every detail as soon as it has been read.
 
@@ -213,7 +208,8 @@ class TunnelView:
             SubterraError: A file cannot be read.
         """
         plan, scene = self._library.plan(title), self._library.tunnels[title].scene
-        centreline = Centreline(cut_piece(plan, length))
+        whole = length >= plan.length - 1e-6 or not np.isfinite(length)
+        centreline = Centreline(plan if whole else plan.slice(0.0, length))
         key = (title, lining, -1.0 if scene is not None else length)
         if key == self._shown:
             return centreline

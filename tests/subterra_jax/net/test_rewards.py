@@ -1,5 +1,6 @@
 """Rewards: docs/tasks.md, "Reward"; the task design has the weights."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -91,3 +92,33 @@ def reward_cases_of_t0(id):
         state = state.replace(furthest=jnp.full(n, station - 0.1))
         state, *_ = advanced(id, state, command)
         yield state, command, np.tile([0.7, -0.3], (n, 1))
+
+
+def test_weights_are_those_of_the_params():
+    env, params, *_ = made("Subterra/Traverse-v1")
+    weights = params.reward.replace(terminal=7.0, coverage=0.0, jerk=1.0)
+    heavy = params.replace(reward=weights, goal_coverage=0.0)
+    start = jax.jit(env.reset)(jax.random.key(0), params)[1]
+    *_, info = jax.jit(env.step)(jax.random.key(1), start, jnp.array([2.0, 0.5]), heavy)
+    names = ("terminal", "coverage", "jerk")
+    assert [float(info[f"reward_{name}"]) for name in names] == [7.0, 0.0, -2.5]
+
+
+def test_ground_covered_before_earns_nothing():
+    env, params, *_ = made("Subterra/TraverseShort-v1")
+    _, state = jax.jit(env.reset)(jax.random.key(0), params)
+    step, rewards, stations = jax.jit(env.step), [], []
+    # Ahead, around on the spot, back, around, and ahead again beyond where it turned.
+    plan = [(2.0, 0.0)] * 15 + [(0.0, np.pi / 2.1)] * 21 + [(1.0, 0.0)] * 10
+    plan += [(0.0, np.pi / 2.1)] * 21 + [(2.0, 0.0)] * 15
+    for k, action in enumerate(plan):
+        _, state, reward, terminated, _, info = step(jax.random.key(k), state, jnp.array(action), params)
+        assert not terminated
+        rewards.append(float(info["reward_coverage"]))
+        stations.append(float(info["station"]))
+        parts = sum(float(value) for name, value in info.items() if name.startswith("reward_"))
+        assert float(reward) == pytest.approx(parts, abs=1e-6)
+    assert min(rewards) == 0.0
+    assert stations[45] < max(stations[:20]) - 0.5
+    assert sum(rewards[36:46]) == 0.0
+    assert sum(rewards) == pytest.approx(100 * max(stations) / 60.0, rel=1e-4)
