@@ -135,8 +135,9 @@ class TrainConfig:
 
     # What may differ when a run goes on; nothing else may.
     LIMITS: ClassVar[tuple[str, ...]] = ("steps", "stop_coverage", "stop_patience", "checkpoint_every")
-    # Whether a policy that once did best is kept although later ones do worse.
-    KEEPS_BEST: ClassVar[bool] = True
+    # Whether a policy that once did best is kept although later ones do worse. The first hundred episodes to end are
+    # the short ones, and easier than those after them: they would choose a policy that has hardly learnt.
+    KEEPS_BEST: ClassVar[bool] = False
 
     @property
     def steps_per_iteration(self) -> int:
@@ -173,7 +174,7 @@ _BY_MEMORY: dict[str, dict[str, Any]] = {
     "stack": {"steps": 200_000_000},
     "gru": {"steps": 300_000_000, "n_envs": 32_768, "unroll": 32, "minibatches": 8},
     "along": {
-        "steps": 8_000_000,
+        "steps": 10_000_000,
         "last_rate": 0.05,
         "n_envs": 2048,
         "minibatches": 4,
@@ -186,7 +187,8 @@ _COVER = {"stop_coverage": 0.9}
 _GPU_COVER: dict[str, Any] = {"n_envs": 1024, "epochs": 4, "minibatches": 4, "hidden": (64, 64)}
 # With a goal and few robots: who stands in half of the range and is not thrown against the walls stops by chance, and
 # does not learn instead to end the way at a wall.
-_CPU_GOAL: dict[str, Any] = {"steps": 4_000_000, "standing": 1.0, "init_turn": 0.1, "last_rate": 0.05}
+_STOP = {"init_turn": 0.1}
+_CPU_GOAL: dict[str, Any] = {"steps": 4_000_000, "standing": 1.0, "last_rate": 0.05}
 # Settings that some memories read and others do not.
 _READ_BY: dict[str, tuple[str, ...]] = {
     "frames": ("stack", "along"),
@@ -221,6 +223,8 @@ def make_config(task: str, preset: str = "cpu", memory: str = "none") -> TrainCo
             settings |= _COVER | (_GPU_COVER if preset == "gpu" else {})
         elif preset == "cpu":
             settings |= _CPU_GOAL
+        if TASKS[task].rule.errand == "stop":
+            settings |= _STOP
     return TrainConfig(**settings)
 
 

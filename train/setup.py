@@ -135,9 +135,12 @@ def _fitting(driver: Driver, given: Policy, config: TrainConfig) -> Policy:
     found = flat(given.network)
     for name, leaf in wanted.items():
         tensor = found.get(name)
-        # One number more in the inputs, the localiser's doubt, is what `along` adds to a policy without memory.
-        if tensor is not None and tensor.shape != leaf.shape and (tensor.shape[0] + 1, *tensor.shape[1:]) == leaf.shape:
-            found[name] = np.concatenate([tensor, np.zeros((1, *tensor.shape[1:]), np.float32)])
+        # One number more in the inputs, the localiser's doubt, is what `along` adds to a policy without memory; earlier
+        # observations come before the newest.
+        doubt = 0 if tensor is None else leaf.shape[0] // config.frames - tensor.shape[0]
+        if tensor is not None and tensor.shape != leaf.shape and doubt in (0, 1) and tensor.shape[1:] == leaf.shape[1:]:
+            earlier = leaf.shape[0] - leaf.shape[0] // config.frames
+            found[name] = np.pad(tensor, [(earlier, doubt), *[(0, 0)] * (tensor.ndim - 1)])
         elif tensor is None or tensor.shape != leaf.shape:
             has = "no such weights" if tensor is None else f"{tuple(tensor.shape)}"
             raise ConfigError(
