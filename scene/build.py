@@ -27,10 +27,9 @@ from scene.fitting.lining import add_lining
 from scene.fitting.rings import fit_ring_survey
 from scene.fitting.trackseen import find_track, measure_gauge
 from scene.judging.judge import Judgement, JudgingConfig, judge_bore, require_trust
-from scene.judging.layers import doubt_layers
 from scene.judging.page import render_page
 from scene.judging.returns import track_zone
-from scene.judging.sanity import doubt_bore, doubt_track
+from scene.judging.sanity import doubt_bore, doubt_layers, doubt_track
 from scene.poses.calibration import UNCALIBRATED, Calibration, find_calibration
 from scene.poses.place import Placed, place_cloud, place_recording
 from scene.progress import Stages

@@ -13,9 +13,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import maximum_filter1d
 from scipy.spatial import cKDTree
 
-from scene.cleaning.follow import Course, follow_bore, join_courses
+from scene.cleaning.follow import N_RAYS, Course, Seed, find_seeds, follow_bore, join_courses
 from scene.cleaning.removed import Cause, Cleaned, list_removed, part_of_cloud
-from scene.cleaning.seeds import N_RAYS, Seed, find_seeds
 from scene.cleaning.sort import end_stations, has_support, look_around, name_bodies, sort_points
 from scene.cleaning.tube import Tube, measure_tube
 from scene.cloud import Cloud, thin_and_count

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from scipy.interpolate import make_lsq_spline
 
 from scene.errors import FitError, Refusal
-from scene.fitting.floorline import fit_floor_line, floor_radius
+from scene.fitting.floor import fit_floor_line, floor_radius
 from scene.geometry import Axis, angle_bins, arc_length, axis_through, bin_medians, measure_section, section_angles
 
 _OVERRUN = 6.0

@@ -11,8 +11,7 @@ from scipy.optimize import least_squares
 from scene.bore import POCKET, STATION_STEP, STRETCH, Bore
 from scene.errors import FitError
 from scene.fitting.assemble import describe_bore
-from scene.fitting.lining import LiningConfig, add_standard_lining
-from scene.fitting.universal import joints_by_number
+from scene.fitting.lining import LiningConfig, add_standard_lining, joints_by_number
 from scene.fitting.unroll import UNSEEN_GROWTH, probability_known
 from scene.geometry import arc_length, axis_through, make_axis, section_angles
 from scene.reading.ringsurvey import RingSurvey

@@ -12,8 +12,7 @@ from scene.cleaning.removed import OUTSIDE, Cause, Removed
 from scene.cloud import Cloud
 from scene.errors import FitError
 from scene.judging.codes import Code, name_span
-from scene.judging.coverage import Coverage, find_unseen, measure_overruns
-from scene.judging.places import Place, find_places
+from scene.judging.places import Coverage, Place, find_places, find_unseen, measure_overruns
 from scene.judging.returns import BEHIND, BEYOND, EXPLAINED, INSIDE, Returns, TrackZone, compare_returns
 
 _FLAG = tyro.conf.arg(prefix_name=False)

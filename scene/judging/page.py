@@ -1,11 +1,198 @@
-"""`build.html`: one page that shows what was seen, cut, filled and doubted; it needs neither network nor script."""
+"""`build.html`: one page that shows what was seen, cut, filled and doubted; it needs neither network nor script.
 
+Its drawings are SVG: plan, profile, strips along the bore, and sections with the returns over them.
+"""
+
+from collections.abc import Iterable
+from html import escape
 from typing import Any
+
+import numpy as np
+from jaxtyping import Float
 
 from scene.bore import Bore
 from scene.judging.codes import name_span
-from scene.judging.drawing import draw_plan, draw_profile, draw_section, draw_strips, text
 from scene.judging.judge import Judgement
+from scene.judging.returns import BEHIND, BEYOND, EXPLAINED, INSIDE, Returns
+
+COLOURS = {EXPLAINED: "#9aa5b1", INSIDE: "#d64545", BEHIND: "#2f6fde", BEYOND: "#c9a227"}
+_WALL = "#111827"
+_WIDTH = 1000  # of a drawing along the bore, in units of the picture
+_MARGIN = 45
+_PLAN_POINTS, _SECTION_POINTS = 6000, 1500  # of each picture, so that the page stays light
+_SEEN_AROUND = 2.0  # m beyond the wall that a section's picture shows
+
+
+def draw_plan(bore: Bore, returns: Returns | None) -> str:
+    """Return the plan, turned so that the bore lies across the page, with the returns by their kind."""
+    plan = bore.position[:, :2]
+    run = plan[-1] - plan[0]
+    turn = np.arctan2(run[1], run[0])
+    rotate = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    half = bore.width[:, None] / 2 * bore.lateral[:, :2]
+    walls = [(plan + half) @ rotate, (plan - half) @ rotate]
+    points, kinds = np.empty((0, 2)), np.empty(0, int)
+    if returns is not None:
+        rows = _sample(len(returns.kind), _PLAN_POINTS)
+        points, kinds = _plan_points(bore, returns, rows) @ rotate, returns.kind[rows]
+    line = plan @ rotate
+    low, high = (np.array([f(v[:, k] for v in walls) for k in (0, 1)]) for f in (_least, _most))
+    low, high = low - 6.0, high + 6.0
+    inside = ((points > low) & (points < high)).all(axis=1) if len(points) else np.empty(0, bool)
+    scale = (_WIDTH - 2 * _MARGIN) / (high[0] - low[0])
+    height = (high[1] - low[1]) * scale + 30
+
+    def place(xy: np.ndarray) -> np.ndarray:
+        return np.column_stack([_MARGIN + (xy[:, 0] - low[0]) * scale, (high[1] - xy[:, 1]) * scale + 5])
+
+    parts = [_dots(place(points[inside & (kinds == kind)]), colour, 1.4) for kind, colour in COLOURS.items()]
+    parts += [_polyline(place(wall), _WALL, 1.2) for wall in walls]
+    parts.append(_polyline(place(line), _WALL, 0.6, "6 4"))
+    for station in _ticks(bore.length):
+        at = place(np.stack([np.interp([station], bore.station, line[:, k]) for k in (0, 1)], axis=1))[0]
+        parts.append(f'<text x="{at[0]:.0f}" y="{height - 6:.0f}" text-anchor="middle">{station:g} m</text>')
+    north = np.array([0.0, 1.0]) @ rotate
+    parts.append(_arrow(_WIDTH - 25, 28, north))
+    return _svg(_WIDTH, height, parts)
+
+
+def draw_profile(bore: Bore) -> str:
+    """Return heights of floor, axis and crown over the station; heights are drawn larger than lengths."""
+    down, up = (int(np.argmin(np.abs(bore.angle - angle))) for angle in (-np.pi / 2, np.pi / 2))
+    z = bore.position[:, 2]
+    floor, crown = z - bore.radius[:, down] * bore.up[:, 2], z + bore.radius[:, up] * bore.up[:, 2]
+    low, high = float(floor.min()) - 0.5, float(crown.max()) + 0.5
+    height = 190
+
+    def place(values: np.ndarray) -> np.ndarray:
+        across = _MARGIN + bore.station / bore.length * (_WIDTH - 2 * _MARGIN)
+        return np.column_stack([across, 10 + (high - values) / (high - low) * (height - 40)])
+
+    parts = [_polyline(place(values), _WALL, width, dash)
+             for values, width, dash in ((floor, 1.6, ""), (z, 0.6, "6 4"), (crown, 1.6, ""))]  # fmt: skip
+    for value in np.linspace(low + 0.5, high - 0.5, 3):
+        y = 10 + (high - value) / (high - low) * (height - 40)
+        parts.append(f'<text x="{_MARGIN - 5}" y="{y + 4:.0f}" text-anchor="end">{value:.1f}</text>')
+    return _svg(_WIDTH, height, [*parts, *_station_axis(bore.length, height)])
+
+
+def draw_strips(judgement: Judgement, length: float) -> str:
+    """Return one strip for each share of the table of stations: dark where all, light where none."""
+    table = judgement.stations
+    if table is None:
+        return ""
+    rows = (
+        ("seen", "wall seen", "#2f855a"), ("floor", "floor seen", "#2f855a"), ("inside", "inside", COLOURS[INSIDE]),
+        ("behind", "behind", "#2f6fde"), ("cut", "cut away", "#c9a227"), ("filled", "filled", "#6b7280"),
+    )  # fmt: skip
+    parts, height = [], 24 * len(rows) + 30
+    scale = (_WIDTH - 2 * _MARGIN - 40) / length
+    for k, (name, title, colour) in enumerate(rows):
+        y = 5 + 24 * k
+        parts.append(f'<text x="{_MARGIN + 32}" y="{y + 13}" text-anchor="end">{title}</text>')
+        for row in table:
+            share = float(row[name])
+            strength = share if name in ("seen", "floor", "filled") else min(share / 0.3, 1.0)
+            if strength > 0.02:
+                parts.append(
+                    f'<rect x="{_MARGIN + 40 + row["start"] * scale:.1f}" y="{y}" height="18" fill="{colour}" '
+                    f'width="{(row["end"] - row["start"]) * scale + 0.3:.1f}" opacity="{strength:.2f}">'
+                    f"<title>{row['start']:.0f} to {row['end']:.0f} m: {share:.0%}</title></rect>"
+                )
+    return _svg(_WIDTH, height, [*parts, *_station_axis(length, height, 40)])
+
+
+def draw_section(bore: Bore, returns: Returns, start: float, end: float) -> str:
+    """Return the section in the middle of some stations, with the returns between them over it."""
+    row = int(bore.row_of((start + end) / 2))
+    wall = np.stack([bore.radius[row] * np.cos(bore.angle), bore.radius[row] * np.sin(bore.angle)], axis=1)
+    low, high = wall.min(axis=0) - _SEEN_AROUND, wall.max(axis=0) + _SEEN_AROUND
+    size = 300
+    scale = size / float((high - low).max())
+
+    def place(points: np.ndarray) -> np.ndarray:  # left is drawn left, as one sees it looking ahead
+        return np.column_stack([(high[0] - points[:, 0]) * scale, (high[1] - points[:, 1]) * scale])
+
+    here = np.flatnonzero((returns.station >= start) & (returns.station <= end))
+    points = np.column_stack([returns.lateral[here], returns.upward[here]])
+    near = ((points > low) & (points < high)).all(axis=1)
+    here, points = here[near], points[near]
+    pick = _sample(len(here), _SECTION_POINTS)
+    parts = [_dots(place(points[pick][returns.kind[here[pick]] == kind]), colour, 2.0)
+             for kind, colour in COLOURS.items()]  # fmt: skip
+    outline = np.concatenate([wall, wall[:1]])
+    parts.append(_polyline(place(outline), _WALL, 1.2))
+    across, tall = (high - low) * scale
+    parts.append(f'<path d="M8 {tall - 8:.0f}h{scale:.1f}" stroke="#111" stroke-width="2"/>')
+    parts.append(f'<text x="8" y="{tall - 12:.0f}">1 m</text>')
+    return _svg(float(across), float(tall), parts)
+
+
+def _least(values: Iterable[np.ndarray]) -> float:
+    return float(min(v.min() for v in values))
+
+
+def _most(values: Iterable[np.ndarray]) -> float:
+    return float(max(v.max() for v in values))
+
+
+def _plan_points(bore: Bore, returns: Returns, rows: np.ndarray) -> Float[np.ndarray, "k 2"]:
+    at = bore.row_of(returns.station[rows])
+    along = returns.station[rows] - bore.station[at]
+    return (
+        bore.position[at, :2] + along[:, None] * bore.tangent[at, :2]
+        + returns.lateral[rows][:, None] * bore.lateral[at, :2]
+    )  # fmt: skip
+
+
+def _sample(count: int, most: int) -> np.ndarray:
+    """Rows spread evenly over a count, `most` of them."""
+    return np.arange(count) if count <= most else np.linspace(0, count - 1, most).astype(np.intp)
+
+
+def _ticks(length: float) -> np.ndarray:
+    step = next(s for s in (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 1e9) if length / s <= 10)
+    return np.arange(0.0, length + 1e-9, step)
+
+
+def _station_axis(length: float, height: float, shift: float = 0.0) -> list[str]:
+    scale = (_WIDTH - 2 * _MARGIN - shift) / length
+    return [
+        f'<text x="{_MARGIN + shift + s * scale:.0f}" y="{height - 6:.0f}" text-anchor="middle">{s:g} m</text>'
+        for s in _ticks(length)
+    ]
+
+
+def _polyline(points: np.ndarray, colour: str, width: float, dash: str = "") -> str:
+    text = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
+    dashes = f' stroke-dasharray="{dash}"' if dash else ""
+    return f'<polyline points="{text}" fill="none" stroke="{colour}" stroke-width="{width}"{dashes}/>'
+
+
+def _dots(points: np.ndarray, colour: str, size: float) -> str:
+    if not len(points):
+        return ""
+    text = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in points)
+    return f'<path d="{text}" stroke="{colour}" stroke-width="{size}" stroke-linecap="round" fill="none"/>'
+
+
+def _arrow(x: float, y: float, direction: np.ndarray) -> str:
+    dx, dy = 14 * direction[0], -14 * direction[1]
+    return (
+        f'<path d="M{x - dx:.1f} {y - dy:.1f}L{x + dx:.1f} {y + dy:.1f}" stroke="#111"/>'
+        f'<circle cx="{x + dx:.1f}" cy="{y + dy:.1f}" r="2.5"/>'
+        f'<text x="{x + 1.7 * dx:.1f}" y="{y + 1.7 * dy + 4:.1f}" text-anchor="middle">y</text>'
+    )
+
+
+def _svg(width: float, height: float, parts: list[str]) -> str:
+    return f'<svg viewBox="0 0 {width:.0f} {height:.0f}" role="img">{"".join(parts)}</svg>'
+
+
+def text(value: object) -> str:
+    """Return a value as text that HTML shows as it is."""
+    return escape(str(value))
+
 
 STYLE = """
 body{font:15px/1.45 system-ui,sans-serif;color:#1f2933;max-width:1060px;margin:24px auto;padding:0 16px}

@@ -1,17 +1,149 @@
-"""Checks for what no tunnel has, with likely causes (unit, axes, poses, clock), and for tracks beyond what was seen."""
+"""Checks for what no tunnel has, with likely causes (unit, axes, poses, clock), and for tracks beyond what was seen.
+
+A bore may lean to one side all along: a mount that is off in roll, or a cloud that was never levelled. Sweeps that all
+err by the same roll fit each other, so nothing blurs. But floor and walls lean together then, where a cross-fall leans
+the floor alone.
+
+A wall may stand twice in a cloud: passes that do not fit each other, or poses that drifted.
+"""
 
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, cKDTree
 
 from scene.bore import Bore
+from scene.cloud import Cloud
 from scene.fitting.trackseen import SeenTrack
 from scene.judging.codes import Code, name_sides, name_span
 from scene.judging.judge import Warned
-from scene.judging.lean import doubt_lean
 from scene.writing.track import Track
+
+_BOTTOM = np.deg2rad(28)  # to each side of straight down: floor
+_FLAT_FLOOR = 0.02  # m rms about a line: with more it is no flat floor
+_LEAST_LEAN = np.deg2rad(1.2)
+_ALIKE = np.deg2rad(0.6)  # about the usual lean
+_MOST_OF_IT = 0.8  # share of the stations that lean alike
+_WALLS = np.deg2rad(
+    np.arange(70.0, 130.0)
+)  # from straight up, to both sides: walls; what hangs under a crown is on one side
+_EVENER, _UNEVEN = 0.5, 0.01  # share of the difference between both sides that is left; m of it when taken as upright
+
+
+def doubt_lean(bore: Bore) -> list[Warned]:
+    """Warn of a flat floor that leans all along, if both walls are alike about a middle that leans as it does."""
+    near = np.abs(np.angle(np.exp(1j * (bore.angle + np.pi / 2)))) < _BOTTOM
+    across, upward = (bore.radius * turn(bore.angle) for turn in (np.cos, np.sin))
+    floor = np.array([_fit_floor(y, z) for y, z in zip(across[:, near], upward[:, near], strict=True)])
+    lean = float(np.nanmedian(floor)) if np.isfinite(floor).any() else 0.0
+    alike = np.abs(floor - lean) < _ALIKE
+    if abs(lean) < _LEAST_LEAN or alike.mean() < _MOST_OF_IT:
+        return []
+    section = np.median(bore.radius[alike], axis=0)
+    upright, leaning = (_differ(bore.angle, section, middle) for middle in (0.0, lean))
+    if upright < _UNEVEN or leaning > _EVENER * upright:
+        return []
+    rows = np.flatnonzero(alike)
+    start, end = float(bore.station[rows[0]]), float(bore.station[rows[-1]])
+    return [Warned(
+        Code.LEAN,
+        f"{name_span(start, end)} floor and walls lean together by {np.rad2deg(abs(lean)):.1f}°, "
+        f"{'left' if lean > 0 else 'right'} side up: is the roll of the LiDAR's mount off, or was the cloud not "
+        "levelled? In a bend it may be built so",
+        start, end,
+    )]  # fmt: skip
+
+
+def _fit_floor(across: Float[np.ndarray, " k"], upward: Float[np.ndarray, " k"]) -> float:
+    """Lean of a flat floor, rad, positive where it rises to the left; NaN where it is not flat."""
+    slope, height = np.polyfit(across, upward, 1)
+    flat = np.sqrt(np.mean((upward - height - slope * across) ** 2)) < _FLAT_FLOOR
+    return float(np.arctan(slope)) if flat else np.nan
+
+
+def _differ(angle: Float[np.ndarray, " m"], section: Float[np.ndarray, " m"], lean: float) -> float:
+    """Mean difference of a section's sides about a middle that leans from upright by some angle to the left, m.
+
+    The axis may stand beside that middle: what a step to the side explains does not count.
+    """
+    left, right = (
+        np.interp(np.pi / 2 + lean + sign * _WALLS, angle, section, period=2 * np.pi) for sign in (1.0, -1.0)
+    )
+    aside = np.sin(_WALLS)
+    return float(np.mean(np.abs(left - right - aside * ((left - right) @ aside) / (aside @ aside))))
+
+
+_PLACES = 1500  # of the wall that are looked at
+_REACH = 0.22  # m around a place
+_LEAST_POINTS = 24  # points of a place
+_NEAR_WALL = 0.30  # m
+_LOWEST = -0.3  # sine of the lowest direction: sleepers and ballast below it are two layers, too
+_THINNEST = 0.02  # m between two layers; nearer is noise
+_APART = 0.92  # share of the variance that lies between two halves: 0.64 of one noisy layer, 0.75 of an even one
+_HALF = 0.15  # least share of the points in each layer
+_MIXED = 0.5  # of the neighbours in other layers that points at random would have
+_DOUBLED = 0.25  # share of the places
+_WINDOW = 10.0  # m
+
+
+def doubt_layers(bore: Bore, cloud: Cloud) -> list[Warned]:
+    """Warn of a wall that most places of some stretch show twice, a few centimetres apart."""
+    station, lateral, upward = bore.axis.local(cloud.points.astype(np.float64))
+    angle = np.arctan2(upward, lateral)
+    column = np.rint((angle - bore.angle[0]) / (2 * np.pi) * len(bore.angle)).astype(np.intp) % len(bore.angle)
+    on_wall = np.abs(np.hypot(lateral, upward) - bore.radius[bore.row_of(station), column]) < _NEAR_WALL
+    on_wall &= (np.sin(angle) > _LOWEST) & (station > 0) & (station < bore.length)
+    wall = cloud.points[on_wall].astype(np.float64)
+    if len(wall) < _PLACES:
+        return []
+    picked = np.arange(0, len(wall), max(1, len(wall) // _PLACES))
+    near = cKDTree(wall).query_ball_point(wall[picked], _REACH)
+    apart = np.array([layers_apart(wall[rows]) if len(rows) >= _LEAST_POINTS else np.nan for rows in near])
+    at, known = station[on_wall][picked], np.isfinite(apart)
+    if known.sum() < _PLACES / 10:
+        return []
+    doubled = known & (apart > 0)
+    count = max(round(bore.length / _WINDOW), 1)
+    window = np.minimum((at / bore.length * count).astype(np.intp), count - 1)
+    share = np.bincount(window[doubled], minlength=count) / np.maximum(np.bincount(window[known], minlength=count), 1)
+    rows = np.flatnonzero(share > _DOUBLED)
+    if not len(rows):
+        return []
+    widest = 100 * float(np.percentile(apart[doubled], 90))
+    start, end = rows[0] / count * bore.length, (rows[-1] + 1) / count * bore.length
+    return [Warned(
+        Code.DOUBLED,
+        f"{name_span(start, end)} the wall shows twice, up to {widest:.0f} cm apart, at "
+        f"{doubled[known].mean():.0%} of its places: two passes of the scan do not fit each other, or its poses "
+        "drifted; register them first: the wall that was built is neither",
+        float(start), float(end),
+    )]  # fmt: skip
+
+
+def layers_apart(points: Float[np.ndarray, "n 3"]) -> float:
+    """Return the distance of two parallel layers that a patch of points makes up, m; 0 where it is one.
+
+    Two passes lie over each other; panels and ribs lie side by side, and make no layers.
+    """
+    centred = points - points.mean(axis=0)
+    frame = np.linalg.eigh(centred.T @ centred)[1]
+    off, place = centred @ frame[:, 0], centred @ frame[:, 1:]
+    order = np.argsort(off)
+    n, below = len(off), np.arange(1, len(off))
+    total = np.cumsum(off[order])[:-1]
+    between = total**2 / below + total**2 / (n - below)  # the mean of all is 0
+    inner = (below > _HALF * n) & (below < (1 - _HALF) * n)
+    cut = int(np.argmax(np.where(inner, between, 0.0)))
+    upper = np.zeros(n, bool)
+    upper[order[cut + 1 :]] = True
+    apart = float(off[upper].mean() - off[~upper].mean())
+    if apart < _THINNEST or between[cut] < _APART * float(off @ off):
+        return 0.0
+    nearest = cKDTree(place).query(place, 2)[1][:, 1]
+    by_chance = 2 * upper.mean() * (1 - upper.mean())
+    return apart if np.mean(upper != upper[nearest]) > _MIXED * by_chance else 0.0
+
 
 _SIZES = (1.0, 30.0)  # m, widths and heights of bores that people make
 _HIGH = 11.0  # m; higher are caverns and stations, and common tunnels in feet

@@ -1,24 +1,218 @@
-"""Every return of an input in one frame, thinned: the scans of a recording by their poses, or a cloud as it is."""
+"""Every return of an input in one frame, thinned: a cloud as it is, or the scans of a recording by their poses.
 
-from dataclasses import dataclass, field, replace
+Poses are given, or come from odometry alone, or from control with odometry and IMU.
+"""
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from scene.cloud import Cloud
-from scene.poses.calibration import Calibration
-from scene.poses.clocks import settle_poses
+from scene.errors import RecordingError
+from scene.poses.calibration import Calibration, Mount
+from scene.poses.clocks import settle_inertial, settle_poses
 from scene.poses.consistency import check_poses, reorder
-from scene.poses.locate import Located, locate_by_control, locate_by_odometry, locate_given
+from scene.poses.imu import Inertial, find_inertial, gyro_guide, level_rotation
+from scene.poses.odometry import LIBRARY, Guide, Odometry, OdometryLog, estimate_odometry
 from scene.poses.registration import register_scans
-from scene.poses.trajectory import Trajectory, load_control, load_tum
+from scene.poses.smoother import Noise, Problem, imu_steps, inertial_problem, odometry_problem, solve_with_heading
+from scene.poses.terms import Chain
+from scene.poses.trajectory import MIN_CONTROL_SHARE, Control, Trajectory, load_control, load_tum
 from scene.progress import Stages
 from scene.reading.cloudfile import read_cloud
 from scene.reading.formats import ReadingConfig, describe, own_readers
 from scene.reading.recording import Recording
 from scene.resume import Partial, hash_inputs, resume_key
+
+
+@dataclass(frozen=True)
+class Located:
+    """Poses of the LiDAR, and their entries in the manifest."""
+
+    # Poses of the LiDAR; in the control's frame where there was one, else level from the first sweep
+    trajectory: Trajectory
+    # `poses`, `length_fixed_by`, `length_uncertainty` (m, 95 %, or `None` where nobody can say) and figures
+    facts: dict[str, Any]
+    estimated: bool = True  # True where the poses were estimated here and are written to the scene
+    most_uncovered: float = 0.05  # Share of the scans that may lie outside the trajectory's time
+
+
+def run_odometry(
+    recording: Recording, guide: Guide | None, progress: Stages, partial: Partial, turn: str = "first"
+) -> Odometry:
+    """Runs LiDAR odometry as a stage of a build, with its partial results."""
+    stage = progress.start(f"LiDAR odometry, {turn} pass", recording.scan_count)
+    return estimate_odometry(recording, guide, stage, OdometryLog(partial, f"odometry-{turn}"))
+
+
+def locate_given(trajectory: Trajectory) -> Located:
+    """Takes given poses; only their maker knows how well they fix the length."""
+    return Located(
+        trajectory,
+        {
+            "poses": "given trajectory",
+            "length_fixed_by": "given trajectory",
+            "length_uncertainty": None,
+            "length_uncertainty_from": "not stated: the trajectory came without one",
+        },
+        estimated=False,
+    )
+
+
+def _find_timed(
+    recording: Recording, calibration: Calibration, auto: bool
+) -> tuple[Inertial | None, Mount | None, dict[str, Any]]:
+    """Return the IMU with its mount, by the LiDAR's clock where `auto`, and the facts of its clock."""
+    inertial, mount = find_inertial(recording, calibration)
+    if inertial is None:
+        return None, None, {}
+    clock, inertial = settle_inertial(recording, inertial, auto)
+    return inertial, mount, clock.facts
+
+
+def locate_by_odometry(
+    recording: Recording, calibration: Calibration, progress: Stages, partial: Partial, auto: bool = False
+) -> Located:
+    """Locates the LiDAR by odometry, helped by the gyro where there is an IMU; raises `FitError` for too few scans.
+
+    With `auto` the clock of the IMU is set right.
+    """
+    inertial, mount, clock = _find_timed(recording, calibration, auto)
+    guide = gyro_guide(inertial, mount) if inertial and mount else None
+    trajectory = run_odometry(recording, guide, progress, partial).trajectory
+    level = level_rotation(recording, trajectory, inertial, mount)
+    poses = Trajectory(trajectory.times, level.apply(trajectory.positions), level * trajectory.rotations, LIBRARY)
+    facts = {
+        "poses": LIBRARY,
+        "imu": inertial.topic if inertial else None,
+        "length_fixed_by": f"odometry ({LIBRARY}); nothing measured the axial scale",
+        "length_uncertainty": None,
+        "length_uncertainty_from": "unknown: nobody measured the axial scale",
+        **clock,
+    }
+    return Located(poses, facts)
+
+
+# Guides: what is trusted of the turn (rad) and the shift (m) from one sweep to the next.
+_BY_CONTROL = (np.deg2rad(0.1), 0.02)
+_BY_CONTROL_WITHOUT_IMU = (np.deg2rad(0.5), 0.02)
+_OUTLIER = 4.0  # standard deviations
+_END_ERROR = 0.05  # m; an end of the bore is found to this, on simulated surveys
+
+
+def locate_by_control(
+    recording: Recording,
+    control: Control,
+    calibration: Calibration,
+    progress: Stages,
+    partial: Partial,
+    auto: bool = False,
+) -> Located:
+    """Locates the LiDAR in the control's frame from control, odometry and IMU, whose clock is set right with `auto`.
+
+    Raises `RecordingError` where the control does not overlap the recording, and `FitError` for too few scans, or where
+    the measurements do not determine the trajectory.
+    """
+    times = recording.stamps
+    if len(times) < 2:
+        raise RecordingError(f"{recording.path}: holds {len(times)} scans; at least 2 are needed")
+    control.require_overlap(times[0], times[-1], recording.path)
+    inertial, mount, clock = _find_timed(recording, calibration, auto)
+    if inertial and mount:
+        problem, chain = _solve_with_imu(recording, inertial, mount, control, calibration, progress, partial)
+        trajectory = _lidar_poses(chain, mount)
+    else:
+        problem, chain = _solve_without_imu(recording, control, calibration, progress, partial)
+        trajectory = _lidar_poses(chain, Mount(np.eye(3), np.zeros(3)))
+    return Located(
+        trajectory,
+        {
+            "poses": f"control, {LIBRARY}" + (f", IMU {inertial.topic}" if inertial else ""),
+            "imu": inertial.topic if inertial else None,
+            "calibration": calibration.name,
+            "prism_lever": calibration.prism,
+            **clock,
+            **_control_facts(problem, chain, control),
+        },
+        # Control often starts late and ends early; what it does not reach is left out, and counted.
+        most_uncovered=1 - MIN_CONTROL_SHARE,
+    )
+
+
+def _solve_with_imu(
+    recording: Recording,
+    inertial: Inertial,
+    mount: Mount,
+    control: Control,
+    calibration: Calibration,
+    progress: Stages,
+    partial: Partial,
+) -> tuple[Problem, Chain]:
+    lever = mount.rotation @ calibration.prism + mount.shift
+    problem, chain = inertial_problem(inertial, control, lever, Noise())
+    guess = _load_or_solve(partial, "smoothed", lambda: solve_with_heading(problem, chain), progress)
+    odometry = run_odometry(recording, Guide(_lidar_poses(guess, mount), True, *_BY_CONTROL), progress, partial)
+    whole = replace(problem, steps=imu_steps(odometry, guess, mount))
+    return whole, _load_or_solve(partial, "smoothed-again", lambda: whole.solve(guess)[0], progress)
+
+
+def _solve_without_imu(
+    recording: Recording, control: Control, calibration: Calibration, progress: Stages, partial: Partial
+) -> tuple[Problem, Chain]:
+    """Smooths twice: the first result guides the second odometry, which then slips less."""
+    guide = None
+    for pass_name in ("first", "second"):
+        odometry = run_odometry(recording, guide, progress, partial, pass_name)
+        problem, guess = odometry_problem(odometry, control, calibration.prism, Noise())
+        chain = _load_or_solve(
+            partial, f"smoothed-{pass_name}", functools.partial(solve_with_heading, problem, guess), progress
+        )
+        guide = Guide(_lidar_poses(chain, Mount(np.eye(3), np.zeros(3))), True, *_BY_CONTROL_WITHOUT_IMU)
+    return problem, chain
+
+
+def _control_facts(problem: Problem, chain: Chain, control: Control) -> dict[str, Any]:
+    """Residuals of the control, and the uncertainty of the length that follows (95 %), for the manifest."""
+    residual = problem.sightings.residual(chain)
+    inlier = np.linalg.norm(residual, axis=1) < _OUTLIER * np.sqrt(3) * problem.sightings.sigma
+    rms = float(np.sqrt(np.mean(residual[inlier] ** 2))) if inlier.any() else float("inf")
+    trusted = max(rms, problem.noise.control)
+    return {
+        "length_fixed_by": "control",
+        "length_uncertainty": float(np.sqrt(2) * np.hypot(2 * trusted, _END_ERROR)),
+        "length_uncertainty_from": "95 %: control residuals, and how well ends are found; not the control's own scale",
+        "control_rows": len(residual),
+        "control_rows_repeated": control.dropped,
+        "control_outliers": int((~inlier).sum()),
+        "control_residual_rms": rms,
+        "control_longest_gap": float(np.diff(control.times).max()),
+    }
+
+
+def _lidar_poses(chain: Chain, mount: Mount) -> Trajectory:
+    attitude = chain.attitude @ mount.rotation
+    return Trajectory(
+        chain.times, chain.position + chain.attitude @ mount.shift, Rotation.from_matrix(attitude), LIBRARY
+    )
+
+
+def _load_or_solve(partial: Partial, name: str, solve: Callable[[], Chain], progress: Stages) -> Chain:
+    """Return a smoothed trajectory, from the partial results where an earlier build got so far."""
+    stage = progress.start("smoothing the trajectory", 1)
+    known = partial.load(name)
+    chain = Chain(**known) if known else solve()
+    # One memory layout whether read back or not: the order of later sums may depend on it.
+    arrays = {field.name: np.ascontiguousarray(getattr(chain, field.name)) for field in fields(Chain)}
+    if not known:
+        partial.save(name, **arrays)
+    stage.advance()
+    return Chain(**arrays)
 
 
 @dataclass(frozen=True)

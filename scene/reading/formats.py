@@ -11,11 +11,10 @@ import tyro
 from scene.errors import RecordingError
 from scene.reading.las_e57 import open_e57, open_las
 from scene.reading.ply_pcd import open_pcd, open_ply
-from scene.reading.ptx import open_ptx
 from scene.reading.ringsurvey import is_ring_survey, read_ring_survey
 from scene.reading.rosbag import RosBag
-from scene.reading.scanfolder import open_folder, scan_files
-from scene.reading.tables import open_parquet, open_table
+from scene.reading.scans import open_folder, scan_files
+from scene.reading.tables import open_parquet, open_ptx, open_table
 from scene.reading.times import TimeConfig
 from subterra_jax.host.loading import source_digest
 

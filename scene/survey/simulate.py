@@ -12,15 +12,22 @@ from rosbags.rosbag1 import Writer
 
 from scene.survey import messages
 from scene.survey.bore import Bore, draw_bore
-from scene.survey.carrier import GRAVITY, Carried, Walk, draw_walk, measure_inertial, measure_prism
-from scene.survey.cast import Caster
+from scene.survey.carrier import (
+    GRAVITY,
+    IMUS,
+    LIDARS,
+    Carried,
+    Walk,
+    calibration,
+    draw_walk,
+    measure_inertial,
+    measure_prism,
+)
+from scene.survey.cast import Caster, n_sweeps, sweeps
 from scene.survey.config import LidarName, SurveyConfig
-from scene.survey.given import GivenBore, read_given
-from scene.survey.given_truth import describe_given
+from scene.survey.given import GivenBore, describe_given, read_given
 from scene.survey.lidar import SCAN_PERIOD, Lidar, Sweep, avia, os1, vlp16
 from scene.survey.mesh import Mesh
-from scene.survey.rack import IMUS, LIDARS, calibration
-from scene.survey.sweeps import n_sweeps, sweeps
 from scene.survey.write import CloudWriter, describe_truth, write_json, write_mesh, write_tum, write_yaml
 from subterra_jax.host.files import replace_file
 

@@ -20,12 +20,10 @@ from scene.judging.page import render_page
 from scene.poses.trajectory import save_tum
 from scene.reconstruction import Reconstruction
 from scene.resume import library_versions
-from scene.writing.furnished import furnish_bore, planar_segments
-from scene.writing.furniture import count_pieces
+from scene.writing.furnished import count_pieces, furnish_bore, planar_segments
 from scene.writing.mesh import as_trimesh, build_solid, open_lining
 from scene.writing.mjcf import SceneConfig, write_scene
-from scene.writing.planar import cut_walls, save_tunnel
-from scene.writing.shell import Variant, seams, shell_fields
+from scene.writing.planar import Variant, cut_walls, save_tunnel, seams, shell_fields
 from scene.writing.track import Track, describe_track, track_provenance
 from subterra_jax.host.versions import VERSION
 

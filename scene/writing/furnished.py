@@ -1,16 +1,239 @@
-"""The variant `furnished`: the bore with niches for cross-passages, furniture, and what a planar LiDAR sees of it."""
+"""The variant `furnished`: the bore with niches for cross-passages, furniture, and what a planar LiDAR sees of it.
 
-from dataclasses import dataclass, replace
+Furniture is by standard, beside the track of a running tunnel, as boxes that fit the local bore. None of it is read
+from the survey; each kind can be left out, since each is a landmark along the axis.
+"""
+
+from collections import Counter
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from scene.bore import POCKET, Bore
-from scene.writing.furniture import FurnitureConfig, Piece, TunnelSpace, place_furniture
-from scene.writing.track import Track
+from scene.writing.markup import rotation_along
+from scene.writing.track import Track, wall_offset
 from scene.writing.unrolled import recess_boxes, unroll_section
 from scene.writing.walls import Opening
+
+_ROBOT_HEIGHT = 1.0
+_ASIDE = 0.3  # m: a third rail by standard belongs to a track on the axis
+
+
+@dataclass(frozen=True)
+class FurnitureConfig:
+    """Kinds of furniture and their sizes, m; heights are above the top of the sleepers.
+
+    Sources: widths of walkways 0.8 m (low) to 1.0 m: metro walkway descriptions; cross-passages 244 m apart: NFPA 130.
+    Bracket pitch and tiers, the third rail's offset, plate pitch and all other sizes are engineering defaults.
+    """
+
+    walkway: bool = True  # Low walkway, on the left.
+    # Width of the walkway; less where it would come within 5 cm of the sleepers, no walkway below 0.5 m.
+    walkway_width: float = 0.8
+    walkway_height: float = 0.30  # Height of the walkway's top.
+    handrail: bool = True  # Handrail on posts along the walkway's wall.
+    handrail_height: float = 1.0  # Height of the handrail above the walkway.
+    post_spacing: float = 2.0  # Spacing of the handrail's posts.
+    post_size: float = 0.05  # Side of a post's square section.
+    cables: bool = True  # Cables on brackets along the right wall.
+    bracket_spacing: float = 1.0  # Spacing of the brackets.
+    bracket_length: float = 0.25  # Length of a bracket out of the wall.
+    tiers: tuple[float, ...] = (0.55, 0.90, 1.25, 1.60)  # Heights of the brackets' arms.
+    cable_diameter: float = 0.06  # Diameter of each tier's bundle.
+    third_rail: bool = True  # Third rail, on the right.
+    third_rail_offset: float = 0.7  # Distance from the running rail, middle to middle.
+    plates: bool = True  # Hectometre plates on the left wall.
+    plate_spacing: float = 100.0  # Spacing of the plates.
+    passage: bool = True  # Doors of cross-passages, in niches of the left wall.
+    passage_spacing: float = 244.0  # Spacing of the doors; the first stands half of it from the start.
+    passage_size: tuple[float, float, float] = (2.0, 2.1, 0.5)  # Length, height and depth of a niche.
+    lamps: bool = True  # Lamps at the crown.
+    lamp_spacing: float = 12.0  # Spacing of the lamps.
+    gauge: float = 0.9  # Half the width about the axis that nothing may enter up to a robot's height.
+
+
+@dataclass(frozen=True)
+class Piece:
+    """One box of furniture."""
+
+    kind: str  # Kind of furniture
+    material: str  # Material of the scene
+    centre: Float[np.ndarray, "3"]  # m
+    rotation: Rotation  # X along the bore, y to the left, z upwards
+    half: Float[np.ndarray, "3"]  # Half its sizes, m
+    low: bool  # True where a robot could run into it
+
+    def corners(self) -> Float[np.ndarray, "8 3"]:
+        """Return the corners, m; the last bit of a corner's number tells lower from upper."""
+        signs = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+        return self.centre + self.rotation.apply(signs * self.half)
+
+
+@dataclass(frozen=True, eq=False)
+class TunnelSpace:
+    """The room in the tunnel for furniture."""
+
+    bore: Bore  # The bore
+    track: Track  # Its track
+    config: FurnitureConfig  # Furniture to place
+    # First and last station of each niche of the left wall, m
+    keep_out: list[tuple[float, float]] = field(default_factory=list)
+
+    def wall(self, start: float, end: float, height: float, side: int) -> tuple[float, float]:
+        """Return nearest and furthest distance of the wall from the axis at a height over the sleepers, m."""
+        offset = self._offset(height, side)
+        step = self.bore.station[1]
+        near = offset[int(start / step) : int(np.ceil(end / step)) + 1]
+        return float(near.min()), float(near.max())
+
+    @property
+    def track_reach(self) -> float:
+        """Largest distance of the middle of a track from the axis, m."""
+        return max((float(np.abs(line.offset).max()) for line in self.track.lines), default=0.0)
+
+    @lru_cache(maxsize=64)  # noqa: B019 a place lives as long as it is furnished
+    def _offset(self, height: float, side: int) -> Float[np.ndarray, " n"]:
+        return wall_offset(self.bore, self.track.elevation + height - self.bore.position[:, 2], side)
+
+    def barred(self, start: float, end: float) -> bool:
+        """Return whether a niche of the left wall lies in a stretch."""
+        return any(start < last + 0.1 and first - 0.1 < end for first, last in self.keep_out)
+
+    def box(
+        self, kind: str, material: str, span: tuple[float, float], across: tuple[float, float], up: tuple[float, float]
+    ) -> Piece:
+        """Return a box between two stations, two distances left of the axis and two heights over the sleepers, m."""
+        line = (self.bore.position[:, 0], self.bore.position[:, 1], self.track.elevation)
+        foot = np.column_stack([np.interp(span, self.bore.station, values) for values in line])
+        rotation = rotation_along(foot[0], foot[1])
+        middle = foot.mean(axis=0) + rotation.apply([0, sum(across) / 2, sum(up) / 2])
+        half = np.array([np.linalg.norm(foot[1] - foot[0]), across[1] - across[0], up[1] - up[0]]) / 2
+        return Piece(kind, material, middle, rotation, half, low=up[0] < _ROBOT_HEIGHT)
+
+
+def place_furniture(space: TunnelSpace) -> list[Piece]:
+    """Places everything that the configuration asks for and the bore has room for."""
+    config = space.config
+    pieces: list[Piece] = []
+    if config.walkway:
+        pieces += _walkway(space)
+    if config.cables:
+        pieces += _cables(space)
+    if config.third_rail and len(space.track.sleeper_station) and space.track_reach < _ASIDE:
+        pieces += _third_rail(space)
+    if config.plates:
+        pieces += _plates(space)
+    if config.lamps:
+        pieces += _lamps(space)
+    return pieces
+
+
+def count_pieces(pieces: list[Piece]) -> dict[str, int]:
+    """Counts the boxes of each kind."""
+    return dict(sorted(Counter(piece.kind for piece in pieces).items()))
+
+
+def _stations(space: TunnelSpace, spacing: float, margin: float = 0.3) -> Float[np.ndarray, " k"]:
+    return np.arange(spacing / 2, space.bore.length - margin, spacing)
+
+
+def _stretches(space: TunnelSpace, spacing: float) -> list[tuple[float, float]]:
+    edge = np.append(np.arange(0.0, space.bore.length - spacing / 2, spacing), space.bore.length)
+    return list(zip(edge[:-1].tolist(), edge[1:].tolist(), strict=True))
+
+
+def _rounded(reach: float) -> float:
+    return reach if reach > _ASIDE else 0.0
+
+
+def _walkway(space: TunnelSpace) -> list[Piece]:
+    config, pieces = space.config, []
+    laid = bool(len(space.track.sleeper_station))
+    least = max(config.gauge, _rounded(space.track_reach) + space.track.config.sleeper_length / 2 + 0.05)
+    foot, top = -space.track.config.protrusion if laid else 0.0, config.walkway_height
+    rail, half = top + config.handrail_height, config.post_size / 2
+    for start, end in _stretches(space, config.post_spacing):
+        near, far = space.wall(start, end, top, 1)
+        inner = max(near - config.walkway_width, least)
+        if near - inner < 0.5:
+            continue
+        pieces.append(space.box("walkway", "concrete_slab", (start, end), (inner, far + 0.02), (foot, top)))
+        wall = min(space.wall(start, end, height, 1)[0] for height in (top, (top + rail) / 2, rail)) - 0.12
+        if not config.handrail or space.barred(start, end):
+            continue
+        middle = (start + end) / 2
+        span = (middle - half, middle + half)
+        pieces.append(space.box("handrail_post", "galvanised", span, (wall - half, wall + half), (top, rail)))
+        tube = (wall - 0.02, wall + 0.02)
+        pieces.append(space.box("handrail", "galvanised", (start, end), tube, (rail - 0.04, rail)))
+    return pieces
+
+
+def _cables(space: TunnelSpace) -> list[Piece]:
+    config, pieces = space.config, []
+    low, high = min(config.tiers) - 0.1, max(config.tiers) + 0.15
+    # An arm begins at the wall at its own height: a wall that is dented there is the nearest.
+    heights = (*np.linspace(low, high, 5), *config.tiers)
+    for station in _stations(space, config.bracket_spacing):
+        span = (station - 0.025, station + 0.025)
+        near = min(space.wall(station, station, height, -1)[0] for height in heights)
+        if near - config.bracket_length < config.gauge:
+            continue
+        pieces.append(space.box("bracket", "galvanised", span, (-near, -near + 0.05), (low, high)))
+        for tier in config.tiers:
+            far = space.wall(station, station, tier, -1)[1]
+            arm = (-far, -near + config.bracket_length)
+            pieces.append(space.box("bracket_arm", "galvanised", span, arm, (tier - 0.04, tier)))
+    for start, end in _stretches(space, 2 * config.bracket_spacing):
+        near = min(space.wall(start, end, height, -1)[0] for height in heights)
+        if near - config.bracket_length < config.gauge:
+            continue
+        middle, half = -near + config.bracket_length / 2, config.cable_diameter / 2
+        for tier in config.tiers:
+            across = (middle - 2 * half, middle + 2 * half)
+            pieces.append(space.box("cable", "cable", (start, end + 0.02), across, (tier, tier + 2 * half)))
+    return pieces
+
+
+def _third_rail(space: TunnelSpace) -> list[Piece]:
+    config, track, pieces = space.config, space.track.config, []
+    middle = -(track.rail_offset + config.third_rail_offset)
+    top = track.pad_thickness + track.rail.height + 0.076
+    for start, end in _stretches(space, 3.0):
+        if space.wall(start, end, top, -1)[0] < -middle + 0.15 or -middle - 0.1 < config.gauge:
+            continue
+        rail, pot, cover = ((middle - half, middle + half) for half in (0.04, 0.05, 0.08))
+        span = (start + 0.5 - 0.05, start + 0.5 + 0.05)
+        pieces.append(space.box("third_rail", "galvanised", (start, end + 0.02), rail, (top - 0.1, top)))
+        pieces.append(space.box("insulator", "insulator", span, pot, (-track.protrusion, top - 0.1)))
+        pieces.append(space.box("third_rail_cover", "cover", (start, end), cover, (top + 0.05, top + 0.07)))
+    return pieces
+
+
+def _plates(space: TunnelSpace) -> list[Piece]:
+    pieces = []
+    for station in np.arange(space.config.plate_spacing, space.bore.length - 0.5, space.config.plate_spacing):
+        if space.barred(station - 0.3, station + 0.3):
+            continue
+        near = min(space.wall(station - 0.25, station + 0.25, height, 1)[0] for height in (1.65, 1.95))
+        span = (station - 0.25, station + 0.25)
+        pieces.append(space.box("hectometre_plate", "plate", span, (near - 0.03, near), (1.65, 1.95)))
+    return pieces
+
+
+def _lamps(space: TunnelSpace) -> list[Piece]:
+    pieces, bore = [], space.bore
+    crown = bore.toward(np.pi / 2)
+    ceiling = bore.position[:, 2] + crown * bore.up[:, 2] - space.track.elevation
+    for station in _stations(space, space.config.lamp_spacing):
+        height = float(np.interp(station, bore.station, ceiling))
+        span = (station - 0.6, station + 0.6)
+        pieces.append(space.box("lamp", "lamp", span, (-0.09, 0.09), (height - 0.14, height - 0.04)))
+    return pieces
+
 
 _DOOR = (1.2, 0.08, 2.0)  # length, thickness, height, m
 _FRAME = 0.15  # of wall left between a niche and the next pocket, m

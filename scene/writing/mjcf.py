@@ -4,22 +4,203 @@ Meshes are for looks and rays; bodies collide with boxes, since MuJoCo collides 
 `scene.writing.markup` says which bits of a body's `conaffinity` make it touch what.
 """
 
+import struct
+import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
+import numpy as np
 import trimesh
+from jaxtyping import Float, UInt8
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from scene.bore import Bore
-from scene.writing.dressing import add_cameras, add_lights, add_materials, add_scout, make_root
-from scene.writing.furnished import Furnished
-from scene.writing.furniture import FurnitureConfig
-from scene.writing.markup import LOW_WALL, SOLID, SceneParts, add_box, add_element, add_mesh
+from scene.writing.furnished import Furnished, FurnitureConfig
+from scene.writing.markup import (
+    DECK,
+    LOW_WALL,
+    SOLID,
+    SceneParts,
+    add_box,
+    add_element,
+    add_mesh,
+    format_numbers,
+    format_quaternion,
+)
 from scene.writing.mesh import has_rings, split_lining, split_skin
 from scene.writing.planar import Walls
 from scene.writing.track import Track
 from scene.writing.trackgeoms import add_nails, add_slabs, add_track
 from scene.writing.walls import add_low_panels, add_niche, add_patches
+
+_SEGMENTS = 6  # of a ring
+_STONES = 900
+
+
+def write_png(path: Path, picture: UInt8[np.ndarray, "height width 3"]) -> None:
+    """Writes an RGB picture as PNG."""
+    height, width, _ = picture.shape
+    rows = np.concatenate([np.zeros((height, 1), np.uint8), picture.reshape(height, -1)], axis=1)
+
+    def chunk(kind: bytes, body: bytes) -> bytes:
+        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    body = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows.tobytes(), 6)) + chunk(b"IEND", b"")
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + body)
+
+
+def concrete_picture(rings: bool, height: int = 512, width: int = 2048) -> UInt8[np.ndarray, "height width 3"]:
+    """Draws one turn of a lining to the right and two rings upwards; joints only where there are rings."""
+    shade = 0.62 + 0.020 * _noise((height, width), (1.0, 1.0), 0) + 0.030 * _noise((height, width), (24.0, 30.0), 1)
+    shade += 0.030 * _noise((height, width), (5.0, 90.0), 2)  # what water leaves on its way down
+    if rings:
+        v, u = np.arange(height)[:, None] / height, np.arange(width)[None, :] / width
+        ring = (v * 2).astype(int)
+        tone = 0.02 * np.random.default_rng(3).standard_normal((2, _SEGMENTS))
+        place = u * _SEGMENTS + 0.5 * ring
+        shade += tone[ring, place.astype(int) % _SEGMENTS]
+        across = np.abs((v * 2 + 0.5) % 1 - 0.5) * height / 2
+        along = np.abs((place + 0.5) % 1 - 0.5) * width / _SEGMENTS
+        joint = np.minimum(across + 0 * along, along * 2)
+        shade -= 0.25 * np.exp(-((joint / 2.5) ** 2)) + 0.06 * np.exp(-((joint / 12.0) ** 2))
+    return _tint(shade, (1.0, 0.985, 0.95))
+
+
+def ballast_picture(size: int = 512) -> UInt8[np.ndarray, "size size 3"]:
+    """Draws broken stone seen from above, repeating at its edges."""
+    rng = np.random.default_rng(4)
+    stone = rng.random((_STONES, 2))
+    tone = 0.40 + 0.09 * rng.standard_normal(_STONES)
+    pixel = (np.indices((size, size)).reshape(2, -1).T + 0.5) / size
+    distance, nearest = cKDTree(stone, boxsize=1.0).query(pixel, 2)
+    edge = np.clip((distance[:, 1] - distance[:, 0]) * size / 9.0, 0.0, 1.0)
+    tilt = ((pixel - stone[nearest[:, 0]] + 0.5) % 1 - 0.5) @ [1.0, 0.6] * 3.0
+    shade = (tone[nearest[:, 0]] + tilt) * (0.35 + 0.65 * edge)
+    return _tint(shade.reshape(size, size), (1.0, 0.96, 0.91))
+
+
+def _noise(shape: tuple[int, int], sigma: tuple[float, float], seed: int) -> Float[np.ndarray, "height width"]:
+    """Smoothed noise of unit variance that repeats at the edges."""
+    white = np.fft.rfft2(np.random.default_rng(seed).standard_normal(shape))
+    v, u = np.fft.fftfreq(shape[0])[:, None] * sigma[0], np.fft.rfftfreq(shape[1])[None, :] * sigma[1]
+    field = np.fft.irfft2(white * np.exp(-2 * np.pi**2 * (v**2 + u**2)), shape)
+    return field / field.std()
+
+
+def _tint(shade: np.ndarray, tint: tuple[float, float, float]) -> np.ndarray:
+    return np.clip(255 * shade[..., None] * np.array(tint), 0, 255).astype(np.uint8)
+
+
+LIT = 7  # OpenGL lights a scene with eight lights, of which the viewer's headlight is one
+_COLOURS = {
+    "sleeper": "0.66 0.65 0.62 1",
+    "recess": "0.34 0.335 0.325 1",
+    "steel": "0.30 0.24 0.20 1",
+    "rail_head": "0.62 0.60 0.58 1",
+    "bolt": "0.25 0.22 0.20 1",
+    "scout": "0.90 0.42 0.08 1",
+    "concrete_slab": "0.58 0.57 0.54 1",
+    "galvanised": "0.62 0.65 0.68 1",
+    "cable": "0.06 0.06 0.07 1",
+    "cover": "0.78 0.62 0.16 1",
+    "insulator": "0.45 0.26 0.18 1",
+    "plate": "0.95 0.95 0.92 1",
+    "door": "0.16 0.36 0.30 1",
+}
+_SHINY = {"rail_head", "galvanised", "scout"}
+
+
+def make_root(name: str) -> ET.Element:
+    """Return the root element with compiler, solver and view."""
+    root = ET.Element("mujoco", model=name)
+    add_element(root, "compiler", angle="radian", meshdir="meshes", texturedir="meshes", autolimits="true")
+    add_element(root, "option", timestep="0.004", integrator="implicitfast", iterations="4", ls_iterations="8")
+    add_element(root, "statistic", extent="12")
+    visual = add_element(root, "visual")
+    add_element(visual, "global", offwidth="1920", offheight="1080", fovy="60")
+    add_element(visual, "quality", offsamples="4")
+    add_element(visual, "headlight", ambient="0.28 0.28 0.29", diffuse="0.32 0.32 0.30", specular="0 0 0")
+    add_element(visual, "map", znear="0.005", zfar="60", fogstart="1.5", fogend="14")
+    add_element(visual, "rgba", fog="0.05 0.05 0.05 1", haze="0.6 0.7 0.8 1")
+    return root
+
+
+def add_materials(parts: SceneParts, rings: bool, reuse: bool) -> None:
+    """Adds pictures and materials; joints of segments are drawn only on a lining that has rings."""
+    for name, picture in (("concrete", lambda: concrete_picture(rings)), ("ballast", ballast_picture)):
+        if not (reuse and (parts.meshes / f"{name}.png").exists()):
+            write_png(parts.meshes / f"{name}.png", picture())
+    sky = {"builtin": "gradient", "rgb1": "0.55 0.70 0.88", "rgb2": "0.90 0.93 0.96", "width": "64", "height": "384"}
+    add_element(parts.asset, "texture", type="skybox", **sky)
+    for name in ("concrete", "ballast"):
+        add_element(parts.asset, "texture", name=name, type="2d", file=f"{name}.png")
+    add_element(parts.asset, "material", name="concrete", texture="concrete", specular="0.15", shininess="0.2")
+    add_element(parts.asset, "material", name="floor", texture="ballast", specular="0")
+    repeat = {"texuniform": "true", "texrepeat": "0.7 0.7"}
+    add_element(parts.asset, "material", name="ballast", texture="ballast", **repeat, specular="0")
+    for name, colour in _COLOURS.items():
+        gloss = ("0.7", "0.6") if name in _SHINY else ("0.1", "0.1")
+        add_element(parts.asset, "material", name=name, rgba=colour, specular=gloss[0], shininess=gloss[1])
+    add_element(parts.asset, "material", name="lamp", rgba="1 0.97 0.88 1", emission="1")
+
+
+def add_lights(world: ET.Element, bore: Bore, track: Track, spacing: float) -> int:
+    """Adds a light at every lamp; those nearest the start are on, since few can be at a time."""
+    station = np.arange(spacing / 2, bore.length, spacing)
+    crown = bore.toward(np.pi / 2)
+    at = bore.axis.at(station)
+    lamp = at.position + (np.interp(station, bore.station, crown) - 0.5)[:, None] * at.up
+    for k, position in enumerate(lamp):
+        add_element(
+            world, "light", name=f"lamp_{k:03d}", pos=format_numbers(position), dir="0 0 -1", cutoff="180",
+            exponent="0", attenuation="1 0.05 0.03", diffuse="0.95 0.91 0.80", specular="0.25 0.25 0.22",
+            castshadow="false", active="true" if k < LIT else "false",
+        )  # fmt: skip
+    return len(lamp)
+
+
+def add_cameras(world: ET.Element, bore: Bore, track: Track) -> None:
+    """Adds views inwards from both portals, along the track from the middle, and of the wall there."""
+    for name, station, ahead, across, height in (
+        ("portal_start", 1.0, 1.0, 0.0, 1.9),
+        ("middle", bore.length / 2, 1.0, 0.9, 1.7),
+        ("wall", bore.length / 2, 0.35, 1.0, 1.6),
+        ("portal_end", bore.length - 1.0, -1.0, 0.0, 1.9),
+    ):
+        at = bore.axis.at(np.array([station]))
+        look = ahead * at.tangent[0] if name != "wall" else 0.5 * at.tangent[0] - 0.85 * at.lateral[0]
+        look = look / np.linalg.norm(look)
+        right = np.cross(look, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        position = at.position[0] + across * at.lateral[0]
+        position[2] = np.interp(station, bore.station, track.elevation) + height
+        axes = format_numbers([*right, *np.cross(right, look)])
+        add_element(world, "camera", name=name, pos=format_numbers(position), xyaxes=axes, fovy="65")
+
+
+def add_scout(world: ET.Element, bore: Bore, track: Track, radius: float, lidar_height: float) -> None:
+    """Adds a robot on four smooth casters, 2 m into the bore; its LiDAR is `lidar_height` above the sleepers, m."""
+    at = bore.axis.at(np.array([min(2.0, bore.length / 2)]))
+    elevation = float(np.interp(at.station[0], bore.station, track.elevation))
+    yaw = Rotation.from_euler("z", np.arctan2(at.tangent[0, 1], at.tangent[0, 0]))
+    start = format_numbers([*at.position[0, :2], elevation + 0.01])
+    body = add_element(world, "body", name="scout", pos=start, quat=format_quaternion(yaw))
+    add_element(body, "freejoint", name="scout")
+    touch = {"contype": "0", "conaffinity": str(LOW_WALL | DECK), "group": "2", "material": "scout"}
+    hull = {"type": "capsule", "size": format_numbers([radius, 0.08]), "pos": "0 0 0.52", "mass": "40"}
+    add_element(body, "geom", name="scout_hull", **hull, **touch)
+    for k, (x, y) in enumerate(((1, 1), (1, -1), (-1, 1), (-1, -1))):
+        add_element(
+            body, "geom", name=f"scout_caster_{k}", type="sphere", size="0.08",
+            pos=format_numbers([0.22 * x, 0.22 * y, 0.08]), mass="1", friction="0.05 0.005 0.0001", **touch,
+        )  # fmt: skip
+    add_element(body, "site", name="lidar", pos=format_numbers([0, 0, lidar_height]), size="0.03")
+    add_element(body, "camera", name="scout", pos="0 0 1.0", xyaxes="0 -1 0 0.1 0 1", fovy="70")
+    add_element(body, "camera", name="chase", pos="-4.0 0 2.2", xyaxes="0 -1 0 0.22 0 1", fovy="60")
+
 
 _NEAR_NICHE = 1.0  # m
 _MATERIAL = {"lining": "concrete", "recess": "recess", "floor": "floor"}

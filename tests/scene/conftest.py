@@ -10,7 +10,7 @@ from scene.bore import POCKET, STATION_STEP, Bore
 from scene.fitting.assemble import measure_extents
 from scene.geometry import N_ANGLES, axis_through, section_angles
 from scene.writing.folder import write_geometry
-from scene.writing.furniture import FurnitureConfig
+from scene.writing.furnished import FurnitureConfig
 from scene.writing.mjcf import SceneConfig
 from scene.writing.track import Track, TrackConfig, lay_track
 from tests.scene.clouds import curved_d_bore

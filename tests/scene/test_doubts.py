@@ -15,9 +15,8 @@ from scene.cleaning.crop import ExtentConfig
 from scene.config import BuildConfig, ReconstructConfig
 from scene.geometry import axis_through
 from scene.judging.judge import DoubtError, JudgingConfig, judge_bore
-from scene.judging.layers import doubt_layers
 from scene.judging.page import render_page
-from scene.judging.sanity import doubt_bore
+from scene.judging.sanity import doubt_bore, doubt_layers
 from tests.scene.clouds import curved_d_bore
 from tests.scene.conftest import arc_bore
 from tests.scene.test_judging import about, block, cloud_of, on_wall

@@ -4,8 +4,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from scene.writing.dressing import LIT, ballast_picture, concrete_picture, write_png
 from scene.writing.mesh import as_trimesh, build_solid, has_rings, open_lining, split_skin
+from scene.writing.mjcf import LIT, ballast_picture, concrete_picture, write_png
 
 
 @pytest.fixture(scope="module")

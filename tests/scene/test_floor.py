@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from scene.bore import Bore
-from scene.fitting import floor, floorline
+from scene.fitting import floor
 from scene.fitting.section import fit_sections
 from tests.scene import railway
 from tests.scene.fits import fitted, straight, thin
@@ -71,7 +71,7 @@ def test_sleepers_that_stand_out_little_do_not_lift_the_ballast(monkeypatch):
     world = World(arch(8.7, 6.6, 3.0), L, low)
     points = SCANS["os1"](world)
     assert abs(np.median(built(world, points, 0.04)[1][8:-8])) < 0.008
-    monkeypatch.setattr(floorline, "_PEAK_HALF", 0.0)  # which leaves the line where it was
+    monkeypatch.setattr(floor, "_PEAK_HALF", 0.0)  # which leaves the line where it was
     assert np.median(built(world, points, 0.04)[1][8:-8]) > 0.008
 
 

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from scene.writing.folder import write_geometry
-from scene.writing.furnished import furnish_bore, planar_segments
-from scene.writing.furniture import FurnitureConfig, TunnelSpace, count_pieces
+from scene.writing.furnished import FurnitureConfig, TunnelSpace, count_pieces, furnish_bore, planar_segments
 from scene.writing.mjcf import SceneConfig
 from scene.writing.track import TrackConfig, lay_track
 from subterra_jax.host.tunnelfile import decode, unit_field

@@ -8,8 +8,8 @@ import pytest
 from scene.bore import Bore
 from scene.cleaning.removed import Cause
 from scene.cloud import Cloud
-from scene.judging.drawing import draw_strips
 from scene.judging.judge import DoubtError, JudgingConfig, Warned, judge_bore, require_trust
+from scene.judging.page import draw_strips
 from scene.judging.returns import BEHIND, BEYOND, EXPLAINED, INSIDE, TrackZone, compare_returns, wall_radius
 
 FLOOR = -3.2

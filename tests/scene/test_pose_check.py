@@ -7,9 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from scene.judging.sanity import doubt_bore
-from scene.poses import bothways, consistency
-from scene.poses.bothways import Tilt, find_tilt, numbers_along
-from scene.poses.consistency import check_poses, reorder
+from scene.poses import consistency
+from scene.poses.consistency import Tilt, check_poses, find_tilt, numbers_along, reorder
 from scene.poses.trajectory import Trajectory
 from scene.reading.recording import Recording
 from tests.scene.bags import write_bag
@@ -149,13 +148,13 @@ def test_a_pitched_mount_shows_in_a_walk_that_begins_outside(tmp_path, monkeypat
         found = tilt(entering, along((0, -3, 0)))
         assert found is not None
         assert "+3.0° in pitch" in found.words
-        monkeypatch.setattr(bothways, "_FIRST", 14)
+        monkeypatch.setattr(consistency, "_FIRST", 14)
         assert tilt(entering, along((0, -3, 0))) is None, "it was taken for a LiDAR that never looks back"
 
 
 def test_a_fan_that_sees_nothing_behind_tells_no_tilt(spun, monkeypatch):
-    look = bothways._look
-    monkeypatch.setattr(bothways, "_look", lambda *words: (rows := look(*words))[rows[:, 3] > 0])
+    look = consistency._look
+    monkeypatch.setattr(consistency, "_look", lambda *words: (rows := look(*words))[rows[:, 3] > 0])
     assert tilt(spun, along((0, 3, 0))) is None
 
 

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from scene.errors import RecordingError
-from scene.export import main
-from scene.robot import write_urdf
+from scene.export import main, write_urdf
 
 SCENE = """<mujoco><asset><material name="scout"/></asset><worldbody><body name="scout" pos="5 6 7"><freejoint/>
 <geom name="hull" type="capsule" size="0.4 0.08" pos="0 0 0.52" mass="40" material="scout"/>

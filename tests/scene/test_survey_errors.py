@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from scene.survey.carrier import IMUS
 from scene.survey.cast import PULSE, Caster, Hits, draw_returns, mix_pixels, noise_sigma
 from scene.survey.config import SensorErrors
 from scene.survey.lidar import Lidar, os1, vlp16
 from scene.survey.mesh import Mesh, Part
-from scene.survey.rack import IMUS
 
 NEAR, FAR = 5.0, 5.3  # m: two walls across the x axis, with an edge at y = 0
 

@@ -7,10 +7,9 @@ import pytest
 
 from scene.bore import POCKET, Bore
 from scene.fitting import pockets
-from scene.fitting.evidence import turned_more_than_chance
+from scene.fitting.evidence import find_ring, turned_more_than_chance
 from scene.fitting.lining import add_lining, pair_pockets
 from scene.fitting.section import Sections
-from scene.fitting.turned import find_ring
 from scene.fitting.unroll import Grid
 from tests.scene import fits
 from tests.scene.fits import thin

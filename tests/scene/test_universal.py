@@ -7,10 +7,17 @@ import numpy as np
 import pytest
 
 from scene.bore import Bore
-from scene.fitting import universal
-from scene.fitting.lining import LiningConfig, add_standard_lining
+from scene.fitting import lining
+from scene.fitting.lining import (
+    N_PLACES,
+    PLACE,
+    LiningConfig,
+    add_standard_lining,
+    draw_places,
+    joints_by_number,
+    radial_joints,
+)
 from scene.fitting.rings import bore_from_rings, fit_rings
-from scene.fitting.universal import N_PLACES, PLACE, draw_places, joints_by_number, radial_joints
 from scene.reading.formats import detect
 from scene.reading.ringsurvey import read_ring_survey
 from scene.writing.planar import ring_pitch
@@ -74,7 +81,7 @@ def test_pockets_stand_at_either_side_of_the_radial_joints_in_the_middle_of_ring
 
 def test_rings_turn_and_a_lining_that_does_not_is_noticed(lined, tmp_path, monkeypatch):
     assert find_unturned(lined[0]) == 0
-    monkeypatch.setattr(universal, "draw_places", lambda rng, count: np.zeros(count, int))
+    monkeypatch.setattr(lining, "draw_places", lambda rng, count: np.zeros(count, int))
     bore, joints = surveyed(survey_text(count=60), tmp_path)
     assert find_unturned(add_standard_lining(bore, UNIVERSAL, False, joints)[0]) > 50
 

@@ -16,12 +16,10 @@ from benchmarks.slam.arena.bags import FormatName, Message
 from benchmarks.slam.arena.drives import REST, Drive, MotionName, draw_drive
 from benchmarks.slam.arena.walls import WallName, draw_walls
 from scene.survey import carrier, messages
-from scene.survey.carrier import Carried, Poses
-from scene.survey.cast import Caster
+from scene.survey.carrier import Carried, Mount, Poses
+from scene.survey.cast import Caster, sweeps
 from scene.survey.config import SensorErrors
 from scene.survey.lidar import Lidar, Sweep, avia, os1, vlp16
-from scene.survey.rack import Mount
-from scene.survey.sweeps import sweeps
 from scene.survey.write import write_tum
 
 SensorName = Literal["avia", "vlp16", "os1-16", "os1-32", "os1-64"]

@@ -11,10 +11,9 @@ import numpy as np
 from jaxtyping import Float
 
 from scene.survey.alignment import MARGIN, Elements, lay_out
-from scene.survey.bore import Bore
+from scene.survey.bore import Bore, Thing, box_thing, round_thing
 from scene.survey.furniture import Furniture, draw_furniture
 from scene.survey.section import Section, d_shape, draw_field
-from scene.survey.surroundings import Thing, box_thing, round_thing
 
 WallName = Literal["smooth", "joints", "pockets", "furnished", "sprayed"]
 WALLS: tuple[WallName, ...] = ("smooth", "joints", "pockets", "furnished", "sprayed")  # in the order of the dial
