@@ -56,7 +56,6 @@ class Bore:
 
     @property
     def axis(self) -> Axis:
-        """The centreline alone."""
         return make_axis(self.station, self.position, self.tangent)
 
     def row_of(self, station: Float[np.ndarray, "..."] | float) -> Int[np.ndarray, "..."]:

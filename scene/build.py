@@ -160,7 +160,6 @@ def reconstruct(
 
 @contextmanager
 def _naming(source: Path) -> Iterator[None]:
-    """Names the input in an error of the fit, where it does not name it itself."""
     try:
         yield
     except FitError as error:
@@ -173,7 +172,6 @@ _ARBITRARY = "arbitrarily: a registered cloud tells no direction, and --reverse 
 
 
 def _fit_cloud(placed: Placed, config: ReconstructConfig, progress: Stages) -> Reconstruction:
-    """Cleans a registered cloud and fits axis, wall, track and lining to it."""
     located = placed.located
     stage = progress.start("fitting the bore", 4)
     everything = crop_cloud(placed.cloud, config.extent.crop)
@@ -212,7 +210,6 @@ def _fit_cloud(placed: Placed, config: ReconstructConfig, progress: Stages) -> R
 
 
 def _fit_rings(path: Path, config: ReconstructConfig, progress: Stages) -> Reconstruction:
-    """Fits a round bore to the rings of an as-built survey."""
     survey = read_ring_survey(path, config.reading.unit, told_columns(path, config.reading.columns))
     if config.extent.reverse:
         survey = survey.reversed()

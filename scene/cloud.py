@@ -86,7 +86,6 @@ class VoxelMean:
         self.returns += int(inside.sum())
 
     def cloud(self) -> Cloud:
-        """Return the mean of each voxel of the points added so far."""
         if not self._parts or self._origin is None:
             return Cloud(np.empty((0, 3), np.float32), np.empty(0, np.float32), np.zeros(3), 0, self.voxel)
         self._compact()
@@ -108,7 +107,6 @@ class VoxelMean:
 
     @classmethod
     def restored(cls, voxel: float, arrays: dict[str, np.ndarray]) -> "VoxelMean":
-        """Return the state that `arrays` returned as arrays."""
         again = cls(voxel)
         again._origin = None if np.isnan(arrays["origin"]).any() else arrays["origin"]
         again.finite, again.returns, again._pending = (int(count) for count in arrays["counts"])

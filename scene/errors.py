@@ -34,12 +34,10 @@ class FitError(SubterraError):
     """
 
     def __init__(self, message: str, code: str = "", page: str = "") -> None:
-        """Keeps the sentence for the user, the code and the report."""
         super().__init__(message)
         self.code, self.page = code, page
 
     def about(self, message: str) -> "FitError":
-        """Return the same error with another sentence."""
         return type(self)(message, self.code, self.page)
 
 

@@ -64,7 +64,6 @@ def write_urdf(path: Path, scene: Path, comment: str) -> None:
 
 
 def _read_body(scene: Path) -> ET.Element:
-    """Return the element of the robot."""
     try:
         root = ET.parse(require_input(scene)).getroot()
     except ET.ParseError as error:

@@ -140,7 +140,6 @@ class Partial:
 
     @property
     def keeps(self) -> bool:
-        """True where saved results are written at all."""
         return self._open
 
     def due(self) -> bool:
@@ -195,7 +194,6 @@ def partial_folder(out: Path) -> Path:
 
 
 def _clear(folder: Path) -> None:
-    """Removes everything in the folder but the lock."""
     for entry in folder.iterdir():
         if entry.name != "lock":
             entry.unlink()

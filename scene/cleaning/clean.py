@@ -204,7 +204,6 @@ def refuse_cloud(
 
 
 def _principal(centred: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "k k"]:
-    """Unit vectors of the longest to the shortest extent."""
     return np.linalg.eigh(centred.T @ centred)[1].T[::-1]
 
 

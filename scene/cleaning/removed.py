@@ -24,7 +24,6 @@ class Cause(IntEnum):
 
     @property
     def words(self) -> str:
-        """The cause in words."""
         return _WORDS[self]
 
 
@@ -91,7 +90,6 @@ class Removed:
         return f", and meets it {told}, where that wall is a guess"
 
     def shifted(self, by: float) -> "Removed":
-        """Return the same stretch with stations that are `by` m larger."""
         mouths = tuple((start + by, end + by) for start, end in self.mouths)
         return replace(self, start=self.start + by, end=self.end + by, mouths=mouths)
 

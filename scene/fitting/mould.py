@@ -25,7 +25,6 @@ class Holes:
     score: Float[np.ndarray, " p"]
 
     def where(self, keep: Bool[np.ndarray, " p"]) -> "Holes":
-        """Return the holes for which `keep` is true."""
         return Holes(self.row[keep], self.column[keep], self.score[keep])
 
 

@@ -63,7 +63,6 @@ class SeenTrack:
 
     @property
     def shows_rails(self) -> bool:
-        """True where the survey shows a railway."""
         return any(line.rails is not None for line in self.lines)
 
 

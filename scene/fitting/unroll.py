@@ -24,7 +24,6 @@ class Grid:
 
     @classmethod
     def over(cls, start: float, end: float, step: float, columns: int) -> "Grid":
-        """Return the grid that covers an interval of stations, m."""
         return cls(start, step, max(int(np.ceil((end - start) / step)), 1), columns)
 
     @property

@@ -76,7 +76,6 @@ class Judgement:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """Entries for the manifest."""
         result: dict[str, Any] = {"warnings": [_entry(warning) for warning in self.warnings]}
         if self.returns is None or self.coverage is None:
             return result

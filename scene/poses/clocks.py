@@ -131,7 +131,6 @@ class Clock:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """Entries for the manifest."""
         known = {"clock_of": self.of, "clock_offset": self.offset, "clock_corrected": self.corrected}
         return {**known, "clock_doubt": self.words}
 

@@ -180,7 +180,6 @@ class PoseCheck:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """Entries for the manifest."""
         return {"wall_thickness": self.thickness, "wall_thickness_in_a_sweep": self.expected, "pose_doubt": self.words}
 
     @property

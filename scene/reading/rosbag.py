@@ -113,7 +113,6 @@ class RosBag(ScanSource):
             self.facts["other_lidar_topics"] = others
 
     def close(self) -> None:
-        """Closes the file."""
         self.reader.close()
 
     def deserialize(self, raw: bytes, message_type: str) -> Any:
@@ -189,7 +188,6 @@ class _Chain:
 
     @property
     def connections(self) -> list[Any]:
-        """Topics and types of all bags."""
         return [connection for own in self._connections for connection in own]
 
     def messages(self, connections: Iterable[Any]) -> Iterator[tuple[Any, int, bytes]]:
@@ -201,7 +199,6 @@ class _Chain:
                 yield from reader.messages(connections=own)
 
     def close(self) -> None:
-        """Closes all files."""
         for reader in self._readers:
             reader.close()
 

@@ -29,7 +29,6 @@ class _NoTopics:
     connections: tuple[Any, ...] = ()
 
     def messages(self, **_: Any) -> Iterator[Any]:
-        """Return no messages."""
         return iter(())
 
 
@@ -77,11 +76,9 @@ class ScanSource:
             yield raw
 
     def close(self) -> None:
-        """Closes the file."""
         self._close()
 
     def deserialize(self, raw: bytes, message_type: str) -> Any:
-        """Return a message of a standard type from `reader` as an object."""
         raise RecordingError(f"{self.path}: holds no {message_type}")
 
 

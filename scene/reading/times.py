@@ -156,7 +156,6 @@ class Spans:
     points: int = 0  # In all of them
 
     def add(self, raw: RawScan) -> None:
-        """Adds one sweep."""
         low = high = np.nan
         if raw.values is not None and len(raw.values):
             values, good = _unwrap(raw.values[:: max(1, len(raw.values) // _SAMPLE)])

@@ -40,7 +40,6 @@ class Alignment:
     slope: CubicHermiteSpline  # Station to angle above the horizontal, rad
 
     def frames(self, station: Float[np.ndarray, "n"]) -> Frames:
-        """Return the frames at `station`, m."""
         heading, slope = self.heading(station), self.slope(station)
         ch, sh, cs, ss = np.cos(heading), np.sin(heading), np.cos(slope), np.sin(slope)
         return Frames(

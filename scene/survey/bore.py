@@ -40,7 +40,6 @@ class Thing:
     outline: Float[np.ndarray, "k 2"]  # Convex corners, left of the axis and above the floor, anticlockwise, m
 
     def describe(self) -> dict[str, Any]:
-        """Return its entry in `truth.json`: its box by station, left and above the floor, m."""
         (right, low), (left, high) = self.outline.min(axis=0), self.outline.max(axis=0)
         sizes = {"start": self.start, "end": self.end, "right": right, "left": left, "low": low, "high": high}
         return {"kind": self.kind, **{name: round(float(value), 6) for name, value in sizes.items()}}
@@ -89,7 +88,6 @@ class Cutting:
     grass: Field  # Unevenness of the slopes by station and offset, m
 
     def describe(self) -> dict[str, Any]:
-        """Return its entry in `truth.json`."""
         return {name: round(float(getattr(self, name)), 6) for name in ("run", "bottom", "slope", "height")}
 
 
@@ -158,7 +156,6 @@ class Bore:
     strays: float = 0.0  # Share of the returns that come from behind the wall, by whatever the wall is made of
 
     def mesh(self) -> Mesh:
-        """Return every surface that a ray can meet."""
         parts = (self.alignment, self.section, self.furniture)
         meshes = [surface_mesh(*parts), track_mesh(*parts), nail_mesh(*parts)]
         meshes += [thing_mesh(self.alignment, self.section, thing) for thing in self.things]

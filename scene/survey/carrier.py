@@ -35,11 +35,9 @@ class Mount:
         return -self.rotation.T @ self.shift
 
     def after(self, first: "Mount") -> "Mount":
-        """Return the mount that applies `first`, then this one."""
         return Mount(self.rotation @ first.rotation, self.rotation @ first.shift + self.shift)
 
     def inverse(self) -> "Mount":
-        """Return the mount from the instrument's coordinates to the other's."""
         return Mount(self.rotation.T, self.origin)
 
 
@@ -140,7 +138,6 @@ class Sway:
     phase: Float[np.ndarray, "k"]  # rad
 
     def __call__(self, time: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-        """Return the value at `time`, s."""
         return np.cos(np.outer(time, self.rate) + self.phase) @ self.amplitude
 
 
@@ -207,11 +204,9 @@ class Walk:
     roll: Sway  # rad
 
     def station(self, time: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-        """Return the station of the carrier, m."""
         return START + self.speed * time + self.ahead(time)
 
     def poses(self, time: Float[np.ndarray, "n"]) -> Poses:
-        """Return the exact poses at `time`, s."""
         station = self.station(time)
         frames = self.bore.alignment.frames(station)
         above = CARRY_HEIGHT - 0.5 * self.bore.section.height(station) + self.above(time)
@@ -228,7 +223,6 @@ class Carried:
     mount: Mount  # Mount of the instrument against the Avia
 
     def poses(self, time: Float[np.ndarray, "n"]) -> Poses:
-        """Return the exact poses at `time`, s."""
         rack = self.walk.poses(time)
         attitude = Rotation.from_quat(rack.quaternion)
         quaternion = (attitude * Rotation.from_matrix(self.mount.rotation.T)).as_quat()

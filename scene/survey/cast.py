@@ -35,7 +35,6 @@ class Caster:
     """
 
     def __init__(self, mesh: Mesh, behind: float = 20.0) -> None:
-        """Takes the mesh, of which `behind` m are kept behind the carrier."""
         self._mesh = mesh
         self._behind = behind
         self._window: int | None = None

@@ -33,7 +33,6 @@ class Heights:
     middle: Float[np.ndarray, "n"]  # Of the height above the centreline, m
 
     def height(self, station: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k"]:
-        """Return the height from the floor to the crown on the axis, m."""
         return np.interp(station, self.station, self.value)
 
 
@@ -56,7 +55,6 @@ class GivenBore:
     strays: float = 0.0
 
     def mesh(self) -> Mesh:
-        """Return every surface that a ray can meet."""
         meshes = [wall_mesh(self.sheet, self.recesses), *self._boxes()]
         at = np.asarray(self.at(self.sheet.station))
         mesh = join_meshes(meshes)
@@ -127,7 +125,6 @@ def read_given(path: Path, lining: str, length: float) -> GivenBore:
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:
-    """Return the fields of a tunnel file that holds a bore in three dimensions."""
     try:
         with np.load(path, allow_pickle=False) as data:
             fields = {name: data[name] for name in data.files}

@@ -71,7 +71,6 @@ def _copy_shape(
     part: Part,
     station: Float[np.ndarray, "k"],
 ) -> Mesh:
-    """One copy of a shape for each centre and frame."""
     vertices = centre[:, None] + np.einsum("kij,vj->kvi", axes, shape)
     every = faces + len(shape) * np.arange(len(centre))[:, None, None]
     parts = np.full(len(centre) * len(faces), part, np.uint8)

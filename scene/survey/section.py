@@ -80,7 +80,6 @@ class Shape:
         return len(self.nodes) // 2
 
     def scaled(self, width: Float[np.ndarray, "n"], height: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n m 2"]:
-        """Return nodes of sections of these sizes, above the floor, m."""
         return self.nodes * np.stack([width / self.width, height / self.height], axis=-1)[:, None]
 
 
@@ -92,7 +91,6 @@ class DShape(Shape):
     spring: float = 3.535  # Nominal height of the springing above the floor, m
 
     def scaled(self, width: Float[np.ndarray, "n"], height: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n m 2"]:
-        """Return nodes of sections of these sizes, above the floor, m."""
         radius = 0.5 * width[:, None]
         spring = height[:, None] - radius
         y, z = self.nodes.T
@@ -198,7 +196,6 @@ class Trend:
     value: tuple[float, ...] = (0.0, 0.0)  # Value at each knot, m
 
     def __call__(self, station: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-        """Return values at `station`, m."""
         return PchipInterpolator(self.station, self.value)(np.clip(station, self.station[0], self.station[-1]))
 
 

@@ -131,7 +131,6 @@ def simulate(config: SurveyConfig, console: Console) -> str:
 def _simulate_device(
     config: SurveyConfig, name: LidarName, walk: Walk, mesh: Mesh, seed: np.random.SeedSequence, console: Console
 ) -> str:
-    """Writes recording, ground truth and calibration of one device."""
     of_lidar, *of_imus = seed.spawn(1 + len(IMUS[name]))
     one, carried = make_device(name, config), Carried(walk, LIDARS[name])
     time = np.arange(round(walk.duration * TRUTH_RATE) + 1) / TRUTH_RATE

@@ -88,7 +88,6 @@ class CloudWriter:
             file.write(points.tobytes())
 
     def __enter__(self) -> "CloudWriter":
-        """Return the writer, open."""
         return self
 
     def __exit__(

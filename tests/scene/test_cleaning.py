@@ -36,10 +36,15 @@ def turned(points: np.ndarray) -> np.ndarray:
     return placed(points, *ORIENTATION)
 
 
+def turned_back(result: Cleaned, points: np.ndarray) -> np.ndarray:
+    """Points of a result in the arch's own frame, `(n, 3)`, m."""
+    back = np.stack([placed(unit, *ORIENTATION) - PLACE for unit in np.eye(3)])
+    return (points + result.cloud.origin - PLACE) @ back.T
+
+
 def axis_offsets(result: Cleaned) -> np.ndarray:
     """Station, lateral and upward place of the axis in the arch's own frame, `(n, 3)`, m."""
-    back = np.stack([placed(unit, *ORIENTATION) - PLACE for unit in np.eye(3)])
-    return (result.axis.position + result.cloud.origin - PLACE) @ back.T
+    return turned_back(result, result.axis.position)
 
 
 def causes(result: Cleaned) -> dict[str, int]:
@@ -85,9 +90,7 @@ def test_strays_anywhere_move_neither_axis_nor_ends():
 def test_a_cutting_is_cut_off_where_the_lining_ends_and_reported():
     result = cleaned(turned(np.concatenate([arch(), cutting(np.random.default_rng(2))])))
     require_axis_in_the_middle(result)
-    kept = (result.cloud.points + result.cloud.origin - PLACE) @ np.stack([
-        placed(unit, *ORIENTATION) - PLACE for unit in np.eye(3)
-    ]).T  # fmt: skip
+    kept = turned_back(result, result.cloud.points)
     assert kept[:, 0].max() == pytest.approx(LENGTH, abs=0.3)
     parts = [part for part in result.removed if part.cause == Cause.BEYOND]
     assert sum(part.points for part in parts) > 5_000
@@ -254,9 +257,7 @@ def test_what_a_wet_floor_mirrors_is_no_bore():
     seen = points[(np.abs(points[:, 1]) < 1.4) & (points[:, 2] > 1.0) & (rng.random(len(points)) < 0.3)]
     result = cleaned(turned(np.concatenate([points, seen * (1.0, 1.0, -1.0)])))
     require_axis_in_the_middle(result)
-    kept = (result.cloud.points + result.cloud.origin - PLACE) @ np.stack(
-        [placed(unit, *ORIENTATION) - PLACE for unit in np.eye(3)]
-    ).T
+    kept = turned_back(result, result.cloud.points)
     assert np.mean(kept[:, 2] < -0.5) < 1e-3
 
 

@@ -1,9 +1,13 @@
 import numpy as np
 import pytest
 
+from scene.build import reconstruct
+from scene.config import ReconstructConfig
 from scene.errors import RecordingError
 from scene.poses.calibration import PRESETS, find_calibration
 from scene.poses.trajectory import load_control
+from scene.progress import Stages
+from tests.scene.bags import write_bag
 from tests.scene.test_trajectory import write
 
 
@@ -36,11 +40,15 @@ def test_control_of_no_use_is_refused_by_name_and_cause(tmp_path, text, cause):
         load_control(write(tmp_path / "p.tum", text))
 
 
-def test_control_of_another_time_is_refused_with_both_times(tmp_path):
-    control = load_control(write(tmp_path / "p.tum", rows(40)))
-    control.require_overlap(0.0, 12.0, tmp_path / "a.bag")
-    with pytest.raises(RecordingError, match=r"p\.tum: control runs from 0\.00 to 11\.70 s, but .*a\.bag from 500\.00"):
-        control.require_overlap(500.0, 560.0, tmp_path / "a.bag")
+def test_control_of_another_time_is_refused_with_both_times_before_any_odometry(tmp_path):
+    control = write(tmp_path / "p.tum", rows(40))
+    load_control(control).require_overlap(0.0, 12.0, tmp_path / "a.bag")
+    points = np.random.default_rng(0).uniform(-3, 3, (200, 3))
+    bag = write_bag(tmp_path / "a.bag", [(500.0 + 0.1 * k, points) for k in range(5)])
+    for poses, said in ((None, r"control runs from 0\.00 to 11\.70 s, but .*a\.bag from 500\.00"),
+                        (control, "control is for a recording without a trajectory")):  # fmt: skip
+        with pytest.raises(RecordingError, match=rf"p\.tum: {said}"):
+            reconstruct(bag, poses, ReconstructConfig(), Stages(), control)
 
 
 def test_the_published_transform_puts_the_prism_on_the_targets_origin():

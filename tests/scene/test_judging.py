@@ -8,7 +8,7 @@ import pytest
 from scene.bore import Bore
 from scene.cleaning.removed import Cause
 from scene.cloud import Cloud
-from scene.judging.judge import DoubtError, JudgingConfig, Warned, judge_bore, require_trust
+from scene.judging.judge import DoubtError, Judgement, JudgingConfig, Warned, judge_bore, require_trust
 from scene.judging.page import draw_strips
 from scene.judging.returns import BEHIND, BEYOND, EXPLAINED, INSIDE, TrackZone, compare_returns, wall_radius
 
@@ -118,12 +118,15 @@ def test_a_thing_is_found_where_it_is_and_named(bore, wall, name):
     assert any(word in warning.text and warning.code == "place" for warning in judgement.warnings)
 
 
+def judged_without(bore: Bore, hide) -> Judgement:
+    """Of returns on the whole wall but those that `hide` takes, by station, lateral and upward offset."""
+    wall = on_wall(bore)
+    seen = ~hide(*wall)
+    return judge_bore(bore, cloud_of(about(bore, *(v[seen] for v in wall))), JudgingConfig())
+
+
 def test_an_unseen_wall_is_named_with_its_side_and_its_stations(bore):
-    station, lateral, upward = on_wall(bore)
-    hidden = (lateral > 2.4) & (station > 8) & (station < 18)
-    judgement = judge_bore(
-        bore, cloud_of(about(bore, *(v[~hidden] for v in (station, lateral, upward)))), JudgingConfig()
-    )
+    judgement = judged_without(bore, lambda station, lateral, _: (lateral > 2.4) & (station > 8) & (station < 18))
     piece = judgement.coverage.pieces[0]
     assert (piece.start, piece.end) == (pytest.approx(8, abs=1.1), pytest.approx(18, abs=1.1))
     assert piece.sides == "left wall"
@@ -132,20 +135,12 @@ def test_an_unseen_wall_is_named_with_its_side_and_its_stations(bore):
 
 
 def test_a_bore_unseen_all_around_is_told_in_plain_words(bore):
-    station, lateral, upward = on_wall(bore)
-    hidden = (station > 8) & (station < 12)
-    judgement = judge_bore(
-        bore, cloud_of(about(bore, *(v[~hidden] for v in (station, lateral, upward)))), JudgingConfig()
-    )
+    judgement = judged_without(bore, lambda station, *_: (station > 8) & (station < 12))
     assert "from 8 to 12 m hardly a return lies all around (" in judgement.warnings[0].text
 
 
 def test_an_unseen_floor_is_named_and_told_station_by_station(bore):
-    station, lateral, upward = on_wall(bore)
-    hidden = (upward < -3.1) & (station > 8) & (station < 18)
-    judgement = judge_bore(
-        bore, cloud_of(about(bore, *(v[~hidden] for v in (station, lateral, upward)))), JudgingConfig()
-    )
+    judgement = judged_without(bore, lambda station, _, upward: (upward < -3.1) & (station > 8) & (station < 18))
     assert "from 8 to 18 m hardly a return lies on the floor" in judgement.warnings[0].text
     table = judgement.stations
     within = (table["start"] > 8.5) & (table["end"] < 17.5)
@@ -157,10 +152,8 @@ def test_an_unseen_floor_is_named_and_told_station_by_station(bore):
 
 
 def test_strays_do_not_count_as_having_seen_a_wall(bore):
-    station, lateral, upward = on_wall(bore)
-    gap = (station > 8) & (station < 18)
-    keep = ~gap | (np.random.default_rng(2).random(len(gap)) < 0.01)
-    judgement = judge_bore(bore, cloud_of(about(bore, *(v[keep] for v in (station, lateral, upward)))), JudgingConfig())
+    few = np.random.default_rng(2).random(60_000) < 0.01
+    judgement = judged_without(bore, lambda station, *_: (station > 8) & (station < 18) & ~few)
     assert judgement.coverage.pieces[0].sides == "all around"
     assert judgement.coverage.share == pytest.approx(14 / 24, abs=0.08)
 

@@ -8,43 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scene.build import reconstruct
-from scene.config import ReconstructConfig
-from scene.errors import RecordingError
-from scene.progress import Stages
-from tests.scene.bags import write_bag, write_tum
-
 ROOT = Path(__file__).parents[2]
 
 
 def run(*arguments: object) -> None:
     done = subprocess.run([sys.executable, "-m", *map(str, arguments)], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-
-
-@pytest.fixture
-def bag(tmp_path):
-    rng = np.random.default_rng(0)
-    return write_bag(tmp_path / "a.bag", [(100.0 + 0.1 * k, rng.uniform(-3, 3, (200, 3))) for k in range(5)])
-
-
-def control_rows(start: float) -> np.ndarray:
-    times = start + 0.3 * np.arange(40)
-    return np.column_stack([times, times - start, np.zeros((40, 6))])
-
-
-def test_control_of_another_day_is_refused_before_any_odometry(bag, tmp_path):
-
-    control = write_tum(tmp_path / "prism.tum", control_rows(0.0))
-    with pytest.raises(RecordingError, match=r"prism\.tum: control runs from 0\.00 to 11\.70 s, but .*a\.bag from 100"):
-        reconstruct(bag, None, ReconstructConfig(), Stages(), control)
-
-
-def test_control_and_a_trajectory_together_are_refused(bag, tmp_path):
-
-    control = write_tum(tmp_path / "prism.tum", control_rows(100.0))
-    with pytest.raises(RecordingError, match=r"prism\.tum: control is for a recording without a trajectory"):
-        reconstruct(bag, control, ReconstructConfig(), Stages(), control)
 
 
 @pytest.fixture(scope="module")

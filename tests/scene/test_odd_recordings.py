@@ -116,11 +116,5 @@ def test_inertial_samples_in_no_known_unit_are_named(tmp_path):
 
 
 @pytest.mark.parametrize("name", CLOUDS)
-@pytest.mark.parametrize("kind", ["empty", "NaN", "one place"])
-def test_an_odd_cloud_of_every_format_ends_in_one_sentence(tmp_path, name, kind):
-    points = {"empty": nothing(), "NaN": np.full((50, 3), np.nan), "one place": np.ones((50, 3), np.float32)}[kind]
-    try:
-        path = CLOUDS[name](tmp_path / name, points)
-    except Exception as error:  # a writer that refuses what its reader then need not fear
-        pytest.skip(f"no such file can be written: {error}")
-    assert outcome(path)
+def test_a_cloud_of_every_format_whose_points_are_one_ends_in_one_sentence(tmp_path, name):
+    assert outcome(CLOUDS[name](tmp_path / name, np.ones((50, 3), np.float32)))

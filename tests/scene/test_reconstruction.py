@@ -67,12 +67,6 @@ def test_a_hole_in_the_survey_is_filled_and_marked():
     assert np.abs(bore.width[at_hole] - known.width).max() < 0.05
 
 
-def test_a_cloud_too_short_is_refused():
-    with pytest.raises(FitError) as raised:
-        axis_of(thin(curved_d_bore(length=5).points))
-    assert raised.value.code == "short"
-
-
 @pytest.mark.parametrize("shape", ["plane", "ball", "noise"])
 def test_a_cloud_without_a_tunnel_is_refused(shape):
     rng = np.random.default_rng(0)

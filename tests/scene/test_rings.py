@@ -63,11 +63,6 @@ def test_a_bad_survey_is_refused_by_name_and_cause(tmp_path, text, error, cause)
         fit_rings(read_ring_survey(tmp_path / "s.csv"))
 
 
-def test_a_folder_without_a_survey_is_refused(tmp_path):
-    with pytest.raises(RecordingError, match="of no known kind"):
-        detect(tmp_path)
-
-
 @needs_metro
 def test_the_real_metro_has_its_published_length_radius_and_centres():
     """Against the best-fit circles that the survey's author published."""

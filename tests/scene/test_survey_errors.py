@@ -8,7 +8,7 @@ import pytest
 from scene.survey.carrier import IMUS
 from scene.survey.cast import PULSE, Caster, Hits, draw_returns, mix_pixels, noise_sigma
 from scene.survey.config import SensorErrors
-from scene.survey.lidar import Lidar, os1, vlp16
+from scene.survey.lidar import Lidar, avia, os1, vlp16
 from scene.survey.mesh import Mesh, Part
 
 NEAR, FAR = 5.0, 5.3  # m: two walls across the x axis, with an edge at y = 0
@@ -88,7 +88,7 @@ def test_range_noise_grows_with_range_and_incidence() -> None:
     assert noise_sigma(SensorErrors(), np.full(1, np.inf, np.float32), np.zeros(1, np.float32))[0] < 0.03
 
 
-@pytest.mark.parametrize("lidar", [vlp16(), os1()], ids=lambda lidar: lidar.name)
+@pytest.mark.parametrize("lidar", [avia(), vlp16(), os1()], ids=lambda lidar: lidar.name)
 def test_echoes_too_weak_are_lost_and_can_be_kept(lidar: Lidar) -> None:
     rng, n = np.random.default_rng(0), 4000
 
@@ -96,15 +96,17 @@ def test_echoes_too_weak_are_lost_and_can_be_kept(lidar: Lidar) -> None:
         return draw_returns(rng, lidar, errors, hits(distance, cosine, n)).mean()
 
     given = SensorErrors()
-    assert share(given, 5.0, 0.8) > 0.99
-    assert share(given, 80.0, 2.8 / 80.0) < 0.01
     middle = (0.3 * 2.8 / lidar.weakest_echo) ** (1 / 3)
+    far = 2.0 * middle
+    assert share(given, 5.0, 0.8) > 0.99
+    assert share(given, far, 2.8 / far) < 0.01
     assert share(given, middle, 2.8 / middle) == pytest.approx(0.498, abs=3 * 0.5 / np.sqrt(n))
     all_kept = replace(given, weak_echoes=False, lost=0.0)
-    assert share(all_kept, 80.0, 2.8 / 80.0) == 1.0
+    assert share(all_kept, far, 2.8 / far) == 1.0
     some = replace(given, weak_echoes=False, lost=0.1)
-    assert share(some, 80.0, 2.8 / 80.0) == pytest.approx(0.9, abs=3 * np.sqrt(0.09 / n))
-    assert share(all_kept, 5.0, -0.5) == share(all_kept, lidar.range_max + 1, 1.0) == share(all_kept, 0.2, 1.0) == 0.0
+    assert share(some, far, 2.8 / far) == pytest.approx(0.9, abs=3 * np.sqrt(0.09 / n))
+    for place in ((5.0, -0.5), (lidar.range_max + 1, 1.0), (np.inf, 1.0), (0.2, 1.0)):
+        assert share(all_kept, *place) == 0.0
 
 
 def test_every_imu_is_mounted_by_a_rotation() -> None:

@@ -7,10 +7,7 @@ import pytest
 
 from scene.survey.__main__ import main
 from scene.survey.alignment import draw_railway, lay_out
-from scene.survey.cast import Hits, draw_returns
-from scene.survey.config import SensorErrors
-from scene.survey.lidar import AVIA_POINT_RATE, avia, avia_directions, avia_point_times
-from scene.survey.mesh import Part
+from scene.survey.lidar import AVIA_POINT_RATE, avia_directions, avia_point_times
 from scene.survey.section import draw_field
 
 
@@ -76,22 +73,6 @@ def test_points_are_timed_within_their_message() -> None:
     offset = avia_point_times(240_000)
     assert (len(offset), offset[0], offset[-1]) == (24_000, 0, 99_995_833)
     assert (np.diff(offset) >= 0).all()
-
-
-def test_far_and_grazing_pulses_are_lost() -> None:
-    rng = np.random.default_rng(0)
-
-    def share(distance: float, cosine: float) -> float:
-        full = [np.full(4000, v, np.float32) for v in (distance, cosine)]
-        hits = Hits(*full, np.full(4000, Part.LINING, np.uint8), np.zeros((4000, 3), np.float32))
-        return draw_returns(rng, avia(), SensorErrors(), hits).mean()
-
-    assert share(5.0, 0.5) > 0.99
-    assert share(40.0, 2.8 / 40.0) > 0.9
-    assert 0.3 < share(67.0, 2.8 / 67.0) < 0.7
-    assert share(120.0, 2.8 / 120.0) < 0.03
-    assert share(120.0, 1.0) > 0.99
-    assert share(5.0, -0.5) == share(0.5, 1.0) == share(200.0, 1.0) == share(np.inf, 1.0) == 0.0
 
 
 @pytest.mark.parametrize("seed", range(6))
