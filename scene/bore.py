@@ -97,7 +97,6 @@ def load_bore(path: Path) -> Bore:
                     "build the scene again with `python -m scene.build`"
                 )
             values = {part.name: data[part.name] for part in fields(Bore) if part.name in data}
-            values.setdefault("confidence", np.full(len(values["station"]), np.nan))  # not in the first files
             return Bore(**values)
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
         raise RecordingError(f"{path}: not a bore file ({error})") from error

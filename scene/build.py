@@ -36,9 +36,8 @@ from scene.progress import Stages
 from scene.reading.formats import describe, detect
 from scene.reading.ringsurvey import read_ring_survey
 from scene.reading.tables import told_columns
-from scene.reconstruction import Reconstruction
 from scene.resume import Partial, hash_inputs, partial_folder
-from scene.writing.folder import write_folder
+from scene.writing.folder import Reconstruction, write_folder
 from scene.writing.track import Track, describe_track, lay_track
 from subterra_jax.host.command import parse, run_command
 from subterra_jax.host.files import replace_file, replace_folder, require_folder

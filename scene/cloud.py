@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 # 21 bits an axis: at 4 cm, 84 km each way.
 _BITS = 21
@@ -33,20 +33,6 @@ def thin_and_count(cloud: Cloud, voxel: float) -> tuple[Float[np.ndarray, "k 3"]
     again.add(cloud.points.astype(np.float64))
     coarse = again.cloud()
     return (coarse.points + coarse.origin).astype(np.float32), coarse.weights
-
-
-def occupied_cells(points: Float[np.ndarray, "n d"], size: float) -> Int[np.ndarray, "k d"]:
-    """Return the cells of a grid that hold points, in order; as NumPy's `unique` of rows, in a fraction of its time.
-
-    Args:
-        points: The points, m.
-        size: Edge length of a cell, m.
-    """
-    cell = np.floor(points / size).astype(np.int64)
-    cell = cell[np.lexsort(cell.T[::-1])]
-    new = np.ones(len(cell), bool)
-    new[1:] = (cell[1:] != cell[:-1]).any(axis=1)
-    return cell[new]
 
 
 class VoxelMean:

@@ -194,9 +194,8 @@ def _triangles(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray
 
 
 def _join(model: mujoco.MjModel, material: int, meshes: list[trimesh.Trimesh]) -> Part:
-    vertices = np.concatenate([mesh.vertices for mesh in meshes])
-    first = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
-    faces = np.concatenate([mesh.faces + start for mesh, start in zip(meshes, first, strict=True)])
+    whole = trimesh.util.concatenate(meshes)
+    vertices, faces = np.asarray(whole.vertices), np.asarray(whole.faces)
     if material < 0:
         return Part("plain", vertices, faces, (0.5, 0.5, 0.5, 1.0), 0.9)
     red, green, blue = (float(value) for value in model.mat_rgba[material, :3] * _texture_mean(model, material))

@@ -126,19 +126,19 @@ def measure_section(angle: Float[np.ndarray, " m"], radius: Float[np.ndarray, " 
     """Measures the polygon `radius(angle)`."""
     lateral, upward = radius * np.cos(angle), radius * np.sin(angle)
     height_grid = np.arange(upward.min(), upward.max(), _HEIGHT_STEP)
-    left, right = (_wall_at(side, lateral, upward, height_grid) for side in (1, -1))
+    left, right = (wall_at(side, lateral, upward, height_grid) for side in (1, -1))
     chord = left - right
     # A maximum of noisy values is too large, so chords are averaged over 0.4 m of height; a circle loses 4 mm.
     window = min(round(_CHORD_WINDOW / _HEIGHT_STEP), len(chord))
     width = float(np.convolve(chord, np.full(window, 1 / window), mode="valid").max())
     long = chord >= _LONG_CHORD * width
     across = float(np.mean((left + right)[long]) / 2)
-    floor, crown = (_wall_at(side, upward, lateral, np.array([across]))[0] for side in (-1, 1))
+    floor, crown = (wall_at(side, upward, lateral, np.array([across]))[0] for side in (-1, 1))
     return Extents(width, float(crown - floor), (across, float(crown + floor) / 2))
 
 
-def _wall_at(side: int, across: np.ndarray, along: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """`across` of the polygon's half on one side, as a function of `along`."""
+def wall_at(side: int, across: np.ndarray, along: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Return `across` of a polygon's half on one side (1 or -1) where `along` is `at`, m."""
     half = np.sign(across) == side
     order = np.argsort(along[half], kind="stable")
     return np.interp(at, along[half][order], across[half][order])

@@ -16,7 +16,6 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import binary_dilation, distance_transform_edt
 from scipy.spatial import cKDTree
 
-from scene.cloud import occupied_cells
 from scene.geometry import angle_bins, bin_angles, bin_medians
 
 _TILE = 6.0  # m between places tried
@@ -59,7 +58,7 @@ def frame_of(direction: Float[np.ndarray, "3"]) -> tuple[Float[np.ndarray, "3"],
 
 def find_seeds(points: Float[np.ndarray, "n 3"]) -> list[Seed]:
     """Return places inside bores, the likeliest first; a bore may have many, an open place has none well enclosed."""
-    middles = (occupied_cells(points[:, :2], _TILE) + 0.5) * _TILE
+    middles = (np.unique(np.floor(points[:, :2] / _TILE), axis=0) + 0.5) * _TILE
     tree = cKDTree(points[:, :2])
     count = np.array([len(rows) for rows in tree.query_ball_point(middles, _TILE)])
     middles = middles[count > 0.3 * np.median(count)]

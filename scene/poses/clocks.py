@@ -14,18 +14,14 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import rankdata
 
 from scene.errors import RecordingError
-from scene.poses.imu import Inertial
+from scene.poses.imu import Inertial, integrals
 from scene.poses.odometry import MIN_POINTS, Guide, Tracker
 from scene.poses.trajectory import Trajectory
 from scene.reading.recording import Recording
-from scene.reading.times import Scan
 
 NOTICED = 0.010  # s; a smaller offset is within what turn rates tell
-_SWEEPS, _FEWEST, _PASSES = (
-    100,
-    40,
-    2,
-)  # that are matched one to the next; with fewer nothing is told; times that they are
+_SWEEPS, _FEWEST = 100, 40  # that are matched one to the next; with fewer nothing is told
+_PASSES = 2  # times that they are matched
 _POINTS = 20_000  # of a sweep
 _WARM_UP = 8  # sweeps that are left out: the map is too thin for them
 _REACH, _STEP = 1.5, 0.005  # s: largest lag that is tried, and between two lags
@@ -53,7 +49,7 @@ def lidar_turns(recording: Recording) -> LidarTurns | None:
     """
     first = max(recording.scan_count // 2 - _SWEEPS // 2, 0)
     numbers = range(first, min(first + _SWEEPS, recording.scan_count))
-    scans = [_thinned(scan) for _, scan in recording.pick(numbers) if len(scan.points) >= MIN_POINTS]
+    scans = [scan.pick(_POINTS) for _, scan in recording.pick(numbers) if len(scan.points) >= MIN_POINTS]
     if len(scans) < _FEWEST:
         return None
     guide = None
@@ -72,18 +68,11 @@ def lidar_turns(recording: Recording) -> LidarTurns | None:
     return LidarTurns(at[:-1], at[1:], steps)
 
 
-def _thinned(scan: Scan) -> Scan:
-    rows = np.linspace(0, len(scan.points) - 1, min(_POINTS, len(scan.points))).astype(np.intp)
-    return Scan(scan.stamp, scan.points[rows], scan.times[rows])
-
-
 def turns_of_gyro(inertial: Inertial) -> Turns:
     """Return the mean turn rates of an IMU over intervals of its own clock, rad/s."""
-    step = 0.5 * (inertial.rate[1:] + inertial.rate[:-1]) * np.diff(inertial.times)[:, None]
-    total = np.vstack([np.zeros(3), np.cumsum(step, axis=0)])
 
     def rates(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-        angle = [np.stack([np.interp(at, inertial.times, column) for column in total.T], axis=1) for at in (start, end)]
+        angle = [integrals(at, inertial.times, inertial.rate) for at in (start, end)]
         return np.linalg.norm(angle[1] - angle[0], axis=1) / (end - start)
 
     return rates

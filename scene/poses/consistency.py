@@ -57,10 +57,9 @@ def find_tilt(scans: list[Scan], poses: Trajectory) -> Tilt | None:
     """Return the tilt that floor and crown show in sweeps along a way; `None` where they show none."""
     rows, about = [], []
     for scan in scans:
-        if not len(scan.points) or not poses.covers(scan.stamp, scan.stamp + float(scan.times.max())):
+        if not len(scan.points) or not poses.covers(scan.stamp, scan.end):
             continue
-        pick = np.linspace(0, len(scan.points) - 1, min(_POINTS_ALONG, len(scan.points))).astype(np.intp)
-        scan = Scan(scan.stamp, scan.points[pick], scan.times[pick])
+        scan = scan.pick(_POINTS_ALONG)
         heading = _heading(poses, scan.stamp)
         if heading is not None:
             position, rotation = poses.at(np.array([scan.stamp]))
@@ -207,7 +206,10 @@ def check_poses(recording: Recording, trajectory: Trajectory, orders: bool = Tru
     groups = [_numbers_of_place(place, recording.scan_count) for place in _PLACES]
     along = numbers_along(recording.stamps, trajectory)
     picked = dict(recording.pick([*(number for group in groups for number in group), *along]))
-    places = [[_thinned(picked[number]) for number in group if _usable(picked[number], trajectory)] for group in groups]
+    places = [
+        [picked[number].pick(_POINTS, _near(picked[number])) for number in group if _usable(picked[number], trajectory)]
+        for group in groups
+    ]
     places = [group for group in places if len(group) >= 2]
     if not places:
         return None
@@ -242,13 +244,7 @@ def _near(scan: Scan) -> np.ndarray:
 def _usable(scan: Scan, trajectory: Trajectory) -> bool:
     """Return whether a sweep has poses, and enough returns nearby."""
     rows = min(_POINTS, len(_near(scan)))
-    return rows > 10 * _NEIGHBOURS and trajectory.covers(scan.stamp, scan.stamp + float(scan.times.max()))
-
-
-def _thinned(scan: Scan) -> Scan:
-    rows = _near(scan)
-    rows = rows[np.linspace(0, len(rows) - 1, min(_POINTS, len(rows))).astype(np.intp)]
-    return Scan(scan.stamp, scan.points[rows], scan.times[rows])
+    return rows > 10 * _NEIGHBOURS and trajectory.covers(scan.stamp, scan.end)
 
 
 def _measure(places: list[list[Scan]], poses: Trajectory, turn: Rotation | None, single: bool) -> tuple[float, float]:

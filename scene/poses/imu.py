@@ -83,6 +83,15 @@ def read_inertial(recording: Recording, topic: str) -> Inertial | None:
     raise RecordingError(f"{recording.path}: {topic} has a median force of {size:.3g}, which is neither g nor m/s²")
 
 
+def integrals(
+    at: Float[np.ndarray, " k"], times: Float[np.ndarray, " n"], values: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "k 3"]:
+    """Return the integrals of sampled values from the first sample to some times, s, by the trapezium rule."""
+    steps = 0.5 * (values[1:] + values[:-1]) * np.diff(times)[:, None]
+    total = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
+    return np.stack([np.interp(at, times, column) for column in total.T], axis=1)
+
+
 _START_TIME = 0.2  # s; short, since a carrier sways
 _LONGEST_GAP = 2.0  # s without IMU samples
 _BY_GYRO = (np.deg2rad(0.05), 0.02)  # rad and m from one sweep to the next

@@ -64,9 +64,8 @@ def register_scans(
     batch = []
     for scan in recording.scans(state.position):
         stage.advance()
-        end = scan.stamp + float(scan.times.max(initial=0.0))
-        state.span = (min(state.span[0], scan.stamp), max(state.span[1], end))
-        if trajectory.covers(scan.stamp, end):
+        state.span = (min(state.span[0], scan.stamp), max(state.span[1], scan.end))
+        if trajectory.covers(scan.stamp, scan.end):
             batch.append(deskew(scan, trajectory))
             state.keep_low(scan, batch[-1], trajectory)
         else:
@@ -114,7 +113,7 @@ class _Registration:
         if self.placed % self.every:
             return
         reach = np.linalg.norm(scan.points, axis=1)
-        ends = np.array([scan.stamp, scan.stamp + float(scan.times.max(initial=0.0))])
+        ends = np.array([scan.stamp, scan.end])
         height = trajectory.at(ends)[0][:, 2].mean() - _BELOW
         near = (reach > _LOW_RANGE[0]) & (reach < _LOW_RANGE[1]) & (points[:, 2] < height)
         self.low.append(points[near])

@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter1d
 from scene.errors import FitError
 from scene.poses import terms
 from scene.poses.calibration import Mount
-from scene.poses.imu import Inertial
+from scene.poses.imu import Inertial, integrals
 from scene.poses.odometry import Odometry
 from scene.poses.terms import Chain, Motion, Sightings, Steps
 from scene.poses.trajectory import Control
@@ -229,7 +229,7 @@ def _make_steps(
     sigma: tuple[float, float, float],
 ) -> Steps:
     """Steps between neighbouring knots, trusted to `sigma`: rad, m across and m along the weakest direction."""
-    back = terms.invert_rotations(attitude[:-1])
+    back = attitude[:-1].mT
     shift = terms.rotate_vectors(back, np.diff(position, axis=0))
     along = weakest[:, :, None] * weakest[:, None, :]
     turn_root = np.broadcast_to(np.eye(3) / sigma[0], along.shape)
@@ -241,10 +241,7 @@ def means_between(
     knots: Float[np.ndarray, " n"], times: Float[np.ndarray, " m"], values: Float[np.ndarray, "m 3"]
 ) -> Float[np.ndarray, "k 3"]:
     """Return the mean of sampled values over each interval between knots, by the trapezium rule."""
-    steps = 0.5 * (values[1:] + values[:-1]) * np.diff(times)[:, None]
-    total = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
-    at = np.stack([np.interp(knots, times, column) for column in total.T], axis=1)
-    return np.diff(at, axis=0) / np.diff(knots)[:, None]
+    return np.diff(integrals(knots, times, values), axis=0) / np.diff(knots)[:, None]
 
 
 def smooth_control(control: Control, times: Float[np.ndarray, " n"]) -> tuple[np.ndarray, np.ndarray]:

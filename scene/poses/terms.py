@@ -39,11 +39,6 @@ def cross_matrices(vector: Vectors) -> Matrices:
     return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
 
 
-def invert_rotations(matrix: Matrices) -> Matrices:
-    """Return the inverse rotations."""
-    return np.swapaxes(matrix, -1, -2)
-
-
 def rotate_vectors(matrix: Matrices, vector: Vectors) -> Vectors:
     """Turns each vector by its matrix."""
     return np.einsum("nij,nj->ni", matrix, vector)
@@ -159,12 +154,12 @@ def add_motion(equations: NormalEquations, chain: Chain, motion: Motion, smooth:
     span = np.diff(chain.times)[:, None]
     turn = (motion.rate - chain.gyro_bias[here]) * span
     before, later = chain.attitude[here], chain.attitude[after]
-    twist = rotation_vectors(invert_rotations(rotation_matrices(turn)) @ invert_rotations(before) @ later)
+    twist = rotation_vectors(rotation_matrices(turn).mT @ before.mT @ later)
     n = len(here)
     first, second, residual = np.zeros((n, 9, KNOT_SIZE)), np.zeros((n, 9, KNOT_SIZE)), np.zeros((n, 9))
     near = _EYE + 0.5 * cross_matrices(twist)
     residual[:, :3] = twist
-    first[:, :3, _TURN] = -near @ invert_rotations(later) @ before
+    first[:, :3, _TURN] = -near @ later.mT @ before
     first[:, :3, _GYRO] = _EYE * span[:, :, None]
     second[:, :3, _TURN] = near
     residual[:, 3:6] = chain.velocity[after] - chain.velocity[here]
@@ -173,7 +168,7 @@ def add_motion(equations: NormalEquations, chain: Chain, motion: Motion, smooth:
         middle = before @ half
         force = motion.force - chain.accel_bias[here]
         residual[:, 3:6] -= (rotate_vectors(middle, force) - (0.0, 0.0, GRAVITY)) * span
-        first[:, 3:6, _TURN] = span[:, :, None] * (middle @ cross_matrices(force) @ invert_rotations(half))
+        first[:, 3:6, _TURN] = span[:, :, None] * (middle @ cross_matrices(force) @ half.mT)
         first[:, 3:6, _GYRO] = -0.5 * span[:, :, None] ** 2 * (middle @ cross_matrices(force))
         first[:, 3:6, _ACCEL] = span[:, :, None] * middle
     first[:, 3:6, _SPEED], second[:, 3:6, _SPEED] = -_EYE, _EYE
@@ -219,7 +214,7 @@ class Sightings:
     def _between(self, chain: Chain) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         share, after = self.share[:, None], self.knot + 1
         position = (1 - share) * chain.position[self.knot] + share * chain.position[after]
-        turn = rotation_vectors(invert_rotations(chain.attitude[self.knot]) @ chain.attitude[after])
+        turn = rotation_vectors(chain.attitude[self.knot].mT @ chain.attitude[after])
         return position, chain.attitude[self.knot] @ rotation_matrices(share * turn), share[:, :, None]
 
     def add_to(self, equations: NormalEquations, chain: Chain, robust: float) -> None:
@@ -248,8 +243,8 @@ class Steps:
     def add_to(self, equations: NormalEquations, chain: Chain, robust: float) -> None:
         """Adds these terms; beyond `robust` standard deviations (Cauchy) a step counts ever less."""
         before, after = chain.attitude[self.first], chain.attitude[self.second]
-        back = invert_rotations(before)
-        twist = rotation_vectors(invert_rotations(self.turn) @ back @ after)
+        back = before.mT
+        twist = rotation_vectors(self.turn.mT @ back @ after)
         way = rotate_vectors(back, chain.position[self.second] - chain.position[self.first])
         near = _EYE + 0.5 * cross_matrices(twist)
         n = len(self.first)
@@ -257,7 +252,7 @@ class Steps:
         first, second = np.zeros((n, 6, KNOT_SIZE)), np.zeros((n, 6, KNOT_SIZE))
         residual[:, :3] = rotate_vectors(self.turn_root, twist)
         residual[:, 3:] = rotate_vectors(self.shift_root, way - self.shift)
-        first[:, :3, _TURN] = -self.turn_root @ near @ invert_rotations(after) @ before
+        first[:, :3, _TURN] = -self.turn_root @ near @ after.mT @ before
         second[:, :3, _TURN] = self.turn_root @ near
         first[:, 3:, _TURN] = self.shift_root @ cross_matrices(way)
         first[:, 3:, _SHIFT] = -self.shift_root @ back

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 import tyro
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 
 TIME_FIELDS = ("t", "time", "offset_time", "timestamp", "time_stamp", "timestamps", "ts")
 STATIC = "none: every sweep is taken as static"
@@ -46,6 +46,17 @@ class Scan:
     stamp: float  # Time of the sweep, s
     points: Float[np.ndarray, "n 3"]  # Returns at their own time, m
     times: Float[np.ndarray, " n"]  # Time of each return after `stamp`, s
+
+    def pick(self, count: int, rows: Int[np.ndarray, " k"] | None = None) -> "Scan":
+        """Return at most `count` returns of all, or of some rows, evenly spread over them."""
+        rows = np.arange(len(self.points)) if rows is None else rows
+        rows = rows[np.linspace(0, len(rows) - 1, min(count, len(rows))).astype(np.intp)]
+        return Scan(self.stamp, self.points[rows], self.times[rows])
+
+    @property
+    def end(self) -> float:
+        """Time of the last return, s."""
+        return self.stamp + float(self.times.max(initial=0.0))
 
 
 @dataclass(frozen=True)

@@ -171,29 +171,16 @@ def _wider_middle(length: float) -> Trend:
     return Trend((third - 0.5 * ramp, third + 0.5 * ramp, 2 * third - 0.5 * ramp, 2 * third + 0.5 * ramp), (0, 1, 1, 0))
 
 
-def _flared_end(length: float) -> Trend:
-    """Return a portal 3 m wider at the last mouth, opening with the square of the distance over 6 m."""
-    share = np.linspace(0.0, 1.0, 7)
-    return Trend(tuple(length - 6.0 + 6.0 * share), tuple(3.0 * share**2))
+def _flare(length: float, run: float, width: float) -> Trend:
+    """Return a last mouth that is wider, opening with the square of the distance over a run, m."""
+    share = np.linspace(0.0, 1.0, int(run) + 1)
+    return Trend(tuple(length - run + run * share), tuple(width * share**2))
 
 
-def _flared_portal(length: float) -> Trend:
-    """Return a mouth 2.5 m wider at the last end, opening with the square of the distance over 8 m."""
-    share = np.linspace(0.0, 1.0, 9)
-    return Trend(tuple(length - 8.0 + 8.0 * share), tuple(2.5 * share**2))
-
-
-def _one_sided(start: float, end: float, ramp: float, width: float) -> Trend:
-    """Return a widening between two stations, with ramps outside them, m."""
-    return Trend((start - ramp, start, end, end + ramp), (0.0, width, width, 0.0))
-
-
-def _station_platform(length: float) -> Trend:
-    return _one_sided(0.35 * length, 0.65 * length, min(4.0, 0.1 * length), 3.0)
-
-
-def _lay_by(length: float) -> Trend:
-    return _one_sided(0.4 * length, 0.6 * length, min(4.0, 0.1 * length), 2.5)
+def _one_sided(length: float, start: float, end: float, width: float) -> Trend:
+    """Return a widening between two shares of a length, with ramps outside them, m."""
+    ramp = min(4.0, 0.1 * length)
+    return Trend((start * length - ramp, start * length, end * length, end * length + ramp), (0.0, width, width, 0.0))
 
 
 def _alcoves(length: float) -> Trend:
@@ -269,19 +256,25 @@ _CLASSES: dict[TruthName, _Class] = {
     "horseshoe": _Class("horseshoe", horseshoe),
     "s-bend": _Class("D", elements=draw_s_bend),
     "grade": _Class("D", elements=draw_grade),
-    "irregular": _Class("irregular", arch, widening=_flared_end, rough=True),
+    "irregular": _Class("irregular", arch, widening=lambda length: _flare(length, 6.0, 3.0), rough=True),
     "circle": _Class("circle", circle),
     "portal": _Class(
-        "horseshoe", lambda: vault(8.7, 6.6, 3.0, 0.3), widening=_flared_portal, roughness=0.04, rings=False,
-        tracks=(2.0, -2.0), cutting=True,
+        "horseshoe", lambda: vault(8.7, 6.6, 3.0, 0.3), widening=lambda length: _flare(length, 8.0, 2.5),
+        roughness=0.04, rings=False, tracks=(2.0, -2.0), cutting=True,
     ),
     "corridor": _Class(
         "rectangle", lambda: rectangle(5.1, 4.4), aside=_alcoves, roughness=0.003, rings=False, tracks=(),
         things=_corridor_things,
     ),
     "works": _Class("D", rings=False, things=_works_things, dark=4.0, strays=0.03),
-    "platform": _Class("D, widening", arch, aside=_station_platform, rings=False, things=_platform_things),
-    "road": _Class("road", lambda: vault(9.6, 7.0, 2.6), aside=_lay_by, rings=False, tracks=(), things=_road_things),
+    "platform": _Class(
+        "D, widening", arch, aside=lambda length: _one_sided(length, 0.35, 0.65, 3.0), rings=False,
+        things=_platform_things,
+    ),
+    "road": _Class(
+        "road", lambda: vault(9.6, 7.0, 2.6), aside=lambda length: _one_sided(length, 0.4, 0.6, 2.5), rings=False,
+        tracks=(), things=_road_things,
+    ),
     "slabtrack": _Class("horseshoe", lambda: vault(5.1, 5.5, 3.0, 0.25), rings=False, rise=0.22),
 }  # fmt: skip
 

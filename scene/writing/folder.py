@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import json
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +12,15 @@ import numpy as np
 import trimesh
 
 from scene.bore import Bore
-from scene.cloud import thin_cloud
+from scene.cleaning.removed import Removed
+from scene.cloud import Cloud, thin_cloud
 from scene.config import BuildConfig
 from scene.errors import FitError
 from scene.fitting.lining import MEASURED, count_alone
+from scene.fitting.trackseen import SeenTrack
 from scene.judging.judge import STATION, Judgement
 from scene.judging.page import render_page
-from scene.poses.trajectory import save_tum
-from scene.reconstruction import Reconstruction
+from scene.poses.trajectory import Trajectory, save_tum
 from scene.resume import library_versions
 from scene.writing.furnished import count_pieces, furnish_bore, planar_segments
 from scene.writing.mesh import as_trimesh, build_solid, open_lining
@@ -26,6 +28,24 @@ from scene.writing.mjcf import SceneConfig, write_scene
 from scene.writing.planar import Variant, cut_walls, save_tunnel, seams, shell_fields
 from scene.writing.track import Track, describe_track, track_provenance
 from subterra_jax.host.versions import VERSION
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """A bore, and all that the manifest says about it."""
+
+    bore: Bore  # Bore in the tunnel frame
+    origin: np.ndarray  # Origin of the tunnel frame in the input's, whole metres
+    inputs: list[dict[str, Any]]  # Name, size and hash of each
+    facts: dict[str, Any]  # Facts for the manifest
+    provenance: dict[str, str]  # Provenance of lining features, for the manifest
+    odometry: Trajectory | None = None  # The estimated poses, where there was no trajectory to be given
+    cloud: Cloud | None = None  # The bore's part of the registered cloud, where there was one
+    everything: Cloud | None = None  # The registered cloud before cleaning
+    removed: tuple[Removed, ...] = ()  # What cleaning cut away, by station of the bore, m
+    cause: np.ndarray | None = None  # `scene.cleaning.removed.Cause` of each point of `everything`, `(n,)`
+    seen: SeenTrack = field(default_factory=SeenTrack)  # Tracks that the cloud shows
+
 
 SCENES = ("scene.xml", "scene_furnished.xml")
 MANIFEST_SCHEMA = "subterra.manifest/1"

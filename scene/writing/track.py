@@ -12,6 +12,7 @@ from scene.bore import Bore
 from scene.errors import FitError
 from scene.fitting.rails import SeenRails
 from scene.fitting.trackseen import SeenLine, SeenTrack
+from scene.geometry import wall_at
 
 _FLAT = 0.10  # a bed this little above the lowest point of the bore is its floor
 _SMOOTHING = 1.0  # m
@@ -186,21 +187,14 @@ def _lay_line(bore: Bore, config: TrackConfig, bed: np.ndarray, seen: SeenLine) 
     )  # fmt: skip
 
 
-def _wall_at(bore: Bore, row: int, height: float | np.ndarray, side: int) -> np.ndarray:
-    """Distance from the axis to the wall on one side at a height above the axis, m."""
-    across, upward = side * bore.radius[row] * np.cos(bore.angle), bore.radius[row] * np.sin(bore.angle)
-    half = across > 0
-    order = np.argsort(upward[half], kind="stable")
-    return np.interp(height, upward[half][order], across[half][order])
-
-
 def _lowest_chord(bore: Bore, half_width: float) -> np.ndarray:
     """Lowest height above the axis, m, at which both walls are at least `half_width` away; 0 where none is."""
     down = -bore.toward(-np.pi / 2)
     levels = np.zeros(len(bore.station))
     for row in range(len(bore.station)):
         grid = np.linspace(down[row], 0.0, 300)
-        narrow = np.minimum(_wall_at(bore, row, grid, 1), _wall_at(bore, row, grid, -1))
+        outline = bore.radius[row] * np.cos(bore.angle), bore.radius[row] * np.sin(bore.angle)
+        narrow = np.minimum(wall_at(1, *outline, grid), -wall_at(-1, *outline, grid))
         wide = np.flatnonzero(narrow >= half_width)
         levels[row] = grid[wide[0]] if len(wide) else 0.0
     return levels

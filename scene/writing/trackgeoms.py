@@ -61,7 +61,7 @@ def fastening_mesh(config: TrackConfig, rail_offset: float | None = None) -> tri
             parts.append(shoulder.apply_translation((0, foot + edge * _SHOULDER_AT, _SHOULDER[2] / 2)))
             path = _CLIP * [edge, edge, 1.0] + [0.0, foot, config.pad_thickness + config.rail.foot_height]
             parts.append(_bent_bar(path, _CLIP_BAR / 2))
-    return _merge_meshes(parts)
+    return trimesh.util.concatenate(parts)
 
 
 def _bent_bar(path: Float[np.ndarray, "k 3"], radius: float) -> trimesh.Trimesh:
@@ -100,13 +100,7 @@ def nail_mesh(bore: Bore, start: float, end: float) -> trimesh.Trimesh | None:
         frame[:3, 3] = wall[k] + nail["depth"] * outward
         bolt = trimesh.creation.cylinder(nail["diameter"] / 2, nail["length"], sections=_BOLT_SIDES)
         parts.append(bolt.apply_transform(frame))
-    return _merge_meshes(parts)
-
-
-def _merge_meshes(parts: list[trimesh.Trimesh]) -> trimesh.Trimesh:
-    offsets = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
-    faces = [part.faces + offset for part, offset in zip(parts, offsets, strict=True)]
-    return trimesh.Trimesh(np.concatenate([p.vertices for p in parts]), np.concatenate(faces), process=False)
+    return trimesh.util.concatenate(parts)
 
 
 _SLAB_THICKNESS = 0.20

@@ -147,7 +147,7 @@ def test_mujocos_rays_see_what_the_plane_holds(level, laid, tunnel, written, var
 
 
 def test_the_niche_is_open_to_bodies_and_closed_at_its_back(level, laid, written):
-    from tests.scene.test_walls import Probe
+    from tests.scene.test_validity import Probe
 
     probe = Probe(written[0] / "scene_furnished.xml")
     at = level.axis.at(np.array([10.0]))

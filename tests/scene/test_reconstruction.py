@@ -1,15 +1,18 @@
-"""Cloud to bore against analytic tunnels."""
+"""Cloud to bore against analytic tunnels: sizes, type of section, and the corner of wall and floor."""
 
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from shapely import LineString, points
 
-from scene.bore import Bore
+from scene.bore import Bore, load_bore
 from scene.cloud import Cloud
 from scene.errors import FitError
 from scene.fitting.section import fit_sections
+from scene.fitting.unroll import median_smooth
 from tests.scene.clouds import KnownBore, curved_d_bore
 from tests.scene.fits import axis_of, rebuilt, thin
+from tests.scene.shapes import PLACE, midline, outline, swept
 
 STRAIGHT = np.array([[0.0] * 3, [30.0, 0.0, 0.0]])
 
@@ -80,3 +83,81 @@ def test_a_cloud_without_a_tunnel_is_refused(shape):
     cloud = thin(points)
     with pytest.raises(FitError):
         fit_sections(cloud, axis_of(cloud))
+
+
+@pytest.mark.parametrize(
+    ("kind", "expected", "crown", "wall"),
+    [
+        ("d", "d", 2.8, np.inf),
+        ("horseshoe", "horseshoe", 2.8, 5.6),
+        ("circle", "circle", 2.75, 2.75),
+        ("circle on a floor", "circle", 2.75, 2.75),
+        ("ellipse", "free", np.nan, np.nan),
+    ],
+)
+def test_a_section_is_told_with_its_radii(kind, expected, crown, wall):
+    bore, _ = rebuilt(swept(kind, 24, yaw=0.8), midline(kind, 24, yaw=0.8))
+    assert len(bore.stretch) == 1
+    (stretch,) = bore.stretch
+    assert stretch["type"] == expected
+    assert stretch["rms"] < 0.004
+    assert stretch["start"] == 0
+    assert stretch["end"] == pytest.approx(bore.length)
+    np.testing.assert_allclose([stretch["crown_radius"], stretch["wall_radius"]], [crown, wall], rtol=0.01)
+
+
+def test_a_change_of_section_is_found_where_it_is():
+    points = np.concatenate([swept("horseshoe", 20, yaw=-1.0), swept("d", 20, yaw=-1.0, start=20.0)])
+    bore, _ = rebuilt(points, midline("d", 40, yaw=-1.0))
+    assert list(bore.stretch["type"]) in (["horseshoe", "d"], ["d", "horseshoe"])
+    assert bore.stretch["end"][0] == pytest.approx(20, abs=2.1)
+    assert set(bore.section_type) == {"horseshoe", "d"}
+
+
+def test_curvature_grade_and_types_are_in_the_bore_file(tmp_path):
+    bore, _ = rebuilt(curved_d_bore(length=40, radius=150, grade=0.01).points)
+    bore.save(tmp_path / "bore.npz")
+    with np.load(tmp_path / "bore.npz") as data:
+        inner = (data["station"] > 5) & (data["station"] < 35)
+        sign = np.sign(np.median(data["grade"]))  # the bore may be run from either end
+        np.testing.assert_allclose(sign * data["curvature"][inner], 1 / 150, rtol=0.1)
+        np.testing.assert_allclose(sign * data["grade"], 0.01, atol=0.003)
+        assert (data["section_type"] == "d").all()
+    again = load_bore(tmp_path / "bore.npz")
+    np.testing.assert_array_equal(again.confidence, bore.confidence)
+    np.testing.assert_array_equal(again.stretch, bore.stretch)
+
+
+def test_confidence_is_high_on_a_wall_that_was_seen():
+    bore, _ = rebuilt(swept("circle", 20, yaw=0.1), midline("circle", 20, yaw=0.1))
+    assert bore.confidence.min() > 0.99
+
+
+RAILS, RAIL_TOP = 0.75, 0.24
+
+
+def with_rails(cloud: np.ndarray, floor: float) -> np.ndarray:
+    rng = np.random.default_rng(1)
+    station = rng.uniform(0.0, 24.0, 40_000)
+    rail = np.stack([station, rng.choice([-RAILS, RAILS], 40_000), floor + RAIL_TOP + 0.01 * station], axis=1)
+    return np.concatenate([cloud, rail + rng.normal(0, [0.0, 0.03, 0.008], rail.shape) + PLACE])
+
+
+@pytest.mark.parametrize("kind", ["d", "horseshoe", "circle on a floor"])
+def test_the_corner_of_wall_and_floor_is_not_cut_off(kind):
+    section = outline(kind)
+    bore, cloud = rebuilt(with_rails(swept(kind, 24.0, yaw=0.0), section[:, 1].min()), midline(kind, 24.0, yaw=0.0))
+    surface = bore.surface()[8:-8] + cloud.origin - PLACE
+    wall = np.stack([surface[..., 1], surface[..., 2] - 0.01 * surface[..., 0]], axis=-1).reshape(-1, 2)
+    true = LineString(section[np.argsort(np.arctan2(*section.T[::-1]))])
+    away = true.distance(points(wall))
+    assert away.max() < 0.06  # a degree of angle is 7 cm of wall: the very corner falls between two
+    assert np.quantile(away, 0.99) < 0.02
+    corner = section[np.argmax(np.hypot(section[:, 0], section[:, 1] - 0.5) * (section[:, 1] < 0))]
+    gap = np.hypot(*(wall - corner).T).min(initial=np.inf)
+    assert gap < 0.06
+
+
+def test_a_window_of_one_column_smooths_along_alone():
+    field = np.tile([[1.0], [1.0], [9.0], [1.0], [1.0]], (1, 4)) + np.arange(4)
+    np.testing.assert_array_equal(median_smooth(field, (3, 1)), np.ones((5, 4)) + np.arange(4))

@@ -1,11 +1,14 @@
+"""Ring surveys in both layouts: circles, design axis, and what is refused by name and cause."""
+
 import numpy as np
 import pytest
 
 from scene.errors import FitError, RecordingError
-from scene.fitting.rings import bore_from_rings, fit_rings
+from scene.fitting.rings import bore_from_rings, compare_with_design, fit_rings
 from scene.reading.formats import detect
 from scene.reading.ringsurvey import read_ring_survey
-from tests.shared import METRO, needs_metro
+from tests.scene.files import RING_HEADER, ring_rows, write_xlsx
+from tests.shared import METRO, SHARED, needs_metro
 
 COLUMNS = ("POINT", "EASTING", "NORTHING", "ELEVATION")
 
@@ -73,3 +76,80 @@ def test_the_real_metro_has_its_published_length_radius_and_centres():
     assert np.sqrt(np.mean(np.sum((fit.centre - reference[:, 1:4]) ** 2, axis=1))) < 0.02
     bore = bore_from_rings(fit, np.floor(np.median(fit.centre, axis=0)))
     assert bore.length == pytest.approx(1283.7, rel=0.002)
+
+
+WATER = SHARED / "data" / "water_tunnel_asbuilt"
+
+
+def fitted_rings(path, **options):
+    return fit_rings(read_ring_survey(path, **options))
+
+
+def test_a_workbook_with_rings_and_design_axis_is_found_and_read(tmp_path):
+    design = [(k, 9000 + 0.5 * k, 990 + 0.5 * k, 500.1, 9.8) for k in range(200)]
+    path = write_xlsx(tmp_path / "s.xlsx", ring_rows(offset=0.04), design)
+    found = detect(tmp_path)
+    assert (found.path, found.format.name) == (path, "rings")
+    survey = read_ring_survey(path)
+    fit = fit_rings(survey)
+    np.testing.assert_allclose(fit.radius, 1.7, atol=1e-6)  # targets stood 4 cm inside the wall
+    where = compare_with_design(fit, survey.design)
+    assert where["chainage_first"] == pytest.approx(9010.0, abs=1e-3)
+    assert where["right_of_design_mean"] == pytest.approx(0.1, abs=1e-3)
+    assert where["above_design_mean"] == pytest.approx(0.2, abs=1e-3)
+
+
+def test_the_same_layout_as_csv_reads_alike(tmp_path):
+    lines = [";".join(RING_HEADER), *(";".join(map(str, row)) for row in ring_rows())]
+    (tmp_path / "s.csv").write_text("\n".join(lines))
+    np.testing.assert_allclose(fitted_rings(tmp_path / "s.csv").radius, 1.7, atol=1e-6)
+
+
+def test_millimetres_by_header_or_flag_become_metres(tmp_path):
+    rows = [(r, p, *(1000 * value for value in rest)) for r, p, *rest in ring_rows()]
+    header = tuple(name.replace("M.", "mm") for name in RING_HEADER)
+    np.testing.assert_allclose(
+        fitted_rings(write_xlsx(tmp_path / "a.xlsx", rows, header=header)).radius, 1.7, atol=1e-6
+    )
+    wrong = write_xlsx(tmp_path / "b.xlsx", rows)
+    np.testing.assert_allclose(fitted_rings(wrong, unit="mm").radius, 1.7, atol=1e-6)
+    with pytest.raises(FitError, match=r"b\.xlsx: ring 0 has a radius of 1700 m; is the unit right"):
+        fitted_rings(wrong)
+
+
+def changed(row, **values):
+    return tuple(values.get(name, value) for name, value in zip("rpenzo", row, strict=True))
+
+
+def test_a_bad_row_of_a_workbook_is_named_by_sheet_and_row(tmp_path):
+    rows = ring_rows()
+    for value in ("n/a", None, float("nan")):
+        path = write_xlsx(tmp_path / "s.xlsx", [*rows[:5], changed(rows[5], n=value), *rows[6:]])
+        with pytest.raises(RecordingError, match=r"s\.xlsx: sheet 'Survey' row 7 is not a ring point"):
+            read_ring_survey(path)
+
+
+@pytest.mark.parametrize(
+    ("edit", "cause"),
+    [
+        (lambda row: changed(row, e=row[2] + 100) if row[0] > 5 else row, "between rings 5 and 6 lie 104.8 m"),
+        (lambda row: changed(row, e=2000 - row[2]) if row[0] > 5 else row, "the tunnel turns back at ring"),
+        (lambda row: changed(row, e=1004.8) if row[0] == 2 else row, "rings 1 and 2 lie at the same place"),
+    ],
+)
+def test_a_gap_a_turn_or_a_repeated_ring_is_named(tmp_path, edit, cause):
+    path = write_xlsx(tmp_path / "s.xlsx", [edit(row) for row in ring_rows()])
+    with pytest.raises(FitError, match=rf"s\.xlsx: .*{cause}"):
+        fitted_rings(path)
+
+
+@pytest.mark.skipif(not WATER.is_dir(), reason="the water tunnel's survey is not here")
+def test_the_real_water_tunnel_has_its_published_diameter_and_lies_on_its_design_axis():
+    survey = read_ring_survey(detect(WATER).path)
+    fit = fit_rings(survey)
+    assert len(fit.names) == 46
+    assert 2 * fit.radius.mean() == pytest.approx(3.396, abs=0.015)
+    assert fit.radius.std() < 0.003, "rings measured with and without a target must agree"
+    where = compare_with_design(fit, survey.design)
+    assert where["chainage_last"] - where["chainage_first"] == pytest.approx(211.05, abs=0.1)
+    assert abs(where["above_design_mean"]) < 0.02

@@ -1,10 +1,17 @@
+"""Trajectories from control, odometry and IMU: term by term, and on a whole survey by the user's own commands."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from scene.errors import FitError
 from scene.poses.smoother import Noise, inertial_problem, odometry_problem, solve_with_heading
-from scene.poses.terms import KNOT_SIZE, Chain, Motion, NormalEquations, Sightings, Steps, add_motion, invert_rotations
+from scene.poses.terms import KNOT_SIZE, Chain, Motion, NormalEquations, Sightings, Steps, add_motion
 from tests.scene import walks
 
 DURATION = 24.0
@@ -73,7 +80,7 @@ def terms():
     rng = np.random.default_rng(2)
     ends = np.arange(3), np.arange(1, 4)
     chain = small_chain()
-    turn = invert_rotations(chain.attitude[:-1]) @ chain.attitude[1:]
+    turn = chain.attitude[:-1].mT @ chain.attitude[1:]
     unit = np.broadcast_to(np.eye(3), (3, 3, 3))
     motion = Motion(
         rng.standard_normal((3, 3)) * 0.1, rng.standard_normal((3, 3)) + np.array([0, 0, 9.8]), 1.0, 1.0, True
@@ -123,3 +130,43 @@ def test_what_nothing_determines_is_an_error():
     equations.add(np.ones((1, 1)), np.array([0]), np.ones((1, 1, 2)))
     with pytest.raises(FitError, match="not determined"):
         equations.solve()
+
+
+ROOT = Path(__file__).parents[2]
+
+
+def run(*arguments: object) -> None:
+    done = subprocess.run([sys.executable, "-m", *map(str, arguments)], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.fixture(scope="module")
+def survey(tmp_path_factory):
+    out = tmp_path_factory.mktemp("survey")
+    run("scene.survey", "--length", 30, "--seed", 77, "--out", out)
+    return out
+
+
+@pytest.mark.slow
+def test_prism_control_gives_the_bore_in_the_surveys_own_frame(survey, tmp_path):
+    from benchmarks.truth import compare, load_truth
+
+    bag, prism = survey / "survey.bag", survey / "prism.tum"
+    run("scene.build", bag, "--control", prism, "--calibration", "geode-gamma", "--out", tmp_path / "scene")
+    comparison = compare(tmp_path / "scene", load_truth(survey / "truth.json"))
+    assert abs(comparison.length_error) < 0.002 * 30 + 0.01
+    assert np.sqrt(np.mean(comparison.lateral**2)) < 0.05
+    assert np.sqrt(np.mean(comparison.width**2)) < 0.04
+    assert np.sqrt(np.mean(comparison.height**2)) < 0.04
+    found = json.loads((tmp_path / "scene" / "manifest.json").read_text())["detected"]
+    assert found["length_fixed_by"] == "control"
+    assert found["imu"] == "/livox/imu"
+    assert abs(comparison.length_error) < found["length_uncertainty"] < 0.2
+
+
+@pytest.mark.slow
+def test_odometry_alone_says_that_nobody_measured_the_length(survey, tmp_path):
+    run("scene.build", survey / "survey.bag", "--out", tmp_path / "scene")
+    found = json.loads((tmp_path / "scene" / "manifest.json").read_text())["detected"]
+    assert "nothing measured the axial scale" in found["length_fixed_by"]
+    assert found["length_uncertainty"] is None

@@ -12,7 +12,7 @@ from scene.progress import Stages
 from scene.reading.cloudfile import read_cloud
 from scene.reading.formats import ReadingConfig, detect
 from scene.reading.ringsurvey import read_ring_survey
-from scene.reconstruction import Reconstruction
+from scene.writing.folder import Reconstruction
 from tests.scene.clouds import curved_d_bore
 from tests.scene.files import write_e57, write_las, write_parquet, write_ply, write_text
 
