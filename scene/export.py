@@ -25,6 +25,7 @@ from trimesh.visual.material import PBRMaterial
 
 from scene.errors import RecordingError, require_input
 from scene.writing.markup import write_xml
+from scene.writing.mesh import join_meshes
 from subterra_jax.host.command import parse, run_command
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.host.files import replace_file, replace_folder, require_file, require_folder
@@ -194,7 +195,7 @@ def _triangles(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray
 
 
 def _join(model: mujoco.MjModel, material: int, meshes: list[trimesh.Trimesh]) -> Part:
-    whole = trimesh.util.concatenate(meshes)
+    whole = join_meshes(meshes)
     vertices, faces = np.asarray(whole.vertices), np.asarray(whole.faces)
     if material < 0:
         return Part("plain", vertices, faces, (0.5, 0.5, 0.5, 1.0), 0.9)

@@ -1,5 +1,7 @@
 """From the bore to triangles: the watertight air volume, the open lining, and the parts in which it is drawn."""
 
+from typing import cast
+
 import numpy as np
 import trimesh
 from jaxtyping import Bool, Float, Int
@@ -40,6 +42,11 @@ def as_trimesh(solid: Manifold) -> trimesh.Trimesh:
     """Return the solid's triangles, normals out of the air."""
     mesh = solid.to_mesh64()
     return trimesh.Trimesh(mesh.vert_properties[:, :3], mesh.tri_verts, process=False)
+
+
+def join_meshes(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
+    """Return one mesh of all triangles; vertices are not merged."""
+    return cast(trimesh.Trimesh, trimesh.util.concatenate(meshes))
 
 
 def open_lining(solid: trimesh.Trimesh, bore: Bore) -> trimesh.Trimesh:

@@ -11,6 +11,7 @@ from scene.bore import Bore
 from scene.geometry import Axis
 from scene.writing import markup
 from scene.writing.markup import DECK, GROUND, SOLID, SceneParts, add_box, add_element
+from scene.writing.mesh import join_meshes
 from scene.writing.track import Line, RailProfile, Track, TrackConfig
 from scene.writing.unrolled import wall_points
 
@@ -61,7 +62,7 @@ def fastening_mesh(config: TrackConfig, rail_offset: float | None = None) -> tri
             parts.append(shoulder.apply_translation((0, foot + edge * _SHOULDER_AT, _SHOULDER[2] / 2)))
             path = _CLIP * [edge, edge, 1.0] + [0.0, foot, config.pad_thickness + config.rail.foot_height]
             parts.append(_bent_bar(path, _CLIP_BAR / 2))
-    return trimesh.util.concatenate(parts)
+    return join_meshes(parts)
 
 
 def _bent_bar(path: Float[np.ndarray, "k 3"], radius: float) -> trimesh.Trimesh:
@@ -100,7 +101,7 @@ def nail_mesh(bore: Bore, start: float, end: float) -> trimesh.Trimesh | None:
         frame[:3, 3] = wall[k] + nail["depth"] * outward
         bolt = trimesh.creation.cylinder(nail["diameter"] / 2, nail["length"], sections=_BOLT_SIDES)
         parts.append(bolt.apply_transform(frame))
-    return trimesh.util.concatenate(parts)
+    return join_meshes(parts)
 
 
 _SLAB_THICKNESS = 0.20

@@ -60,7 +60,7 @@ class Tube:
 
     def surface(self, rng: np.random.Generator) -> np.ndarray:
         start, length, along, left = self._frame()
-        count = int(length * 1500 * self.width / WIDTH)
+        count = int(length * 1000 * self.width / WIDTH)
         radius, wall = self.width / 2, self.height - self.width / 2
         girth = np.array([self.width, wall, np.pi * radius, wall])
         piece, at = rng.choice(4, count, p=girth / girth.sum()), rng.random(count)
