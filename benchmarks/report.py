@@ -19,6 +19,7 @@ from PIL import Image
 from benchmarks.draw.scene import picture
 from benchmarks.results import png_bytes
 from benchmarks.truth import Comparison, Truth, centreline, compare, scene_points, start_placement
+from subterra_jax.host.tunnelfile import read_fields
 from subterra_jax.pictures.renderer import PictureError
 
 _STYLE = """
@@ -145,18 +146,18 @@ def section_errors(comparison: Comparison) -> Figure:
 
 def plan_of_walls(tunnel_path: Path, lining: str = "pockets", stretch: float = 20.0) -> Figure:
     """Draws the first metres of the planar tunnel from above, as the environment's LiDAR sees them."""
-    with np.load(tunnel_path) as tunnel:
-        figure, axes = plt.subplots(figsize=(11, 3), layout="constrained")
-        origin, heading = tunnel["centre"][0], tunnel["tangent"][0]
-        turn = np.array([heading, [-heading[1], heading[0]]])
-        for side in ("left", "right"):
-            wall = tunnel[f"{side}_{lining}"][tunnel[f"{side}_station_{lining}"] < stretch]
-            axes.plot(*(turn @ (wall - origin).T), color=_INK, lw=1.0)
-        axes.plot(*(turn @ (tunnel["centre"][tunnel["station"] < stretch] - origin).T), color=_TRUTH, lw=0.8, ls=":")
-        axes.set(xlabel="m", ylabel="m", aspect="equal")
-        axes.set_title(f"Walls at LiDAR height, {float(tunnel['lidar_height']):g} m above the sleepers ({lining})")
-        axes.grid(alpha=0.3)
-        return figure
+    tunnel = read_fields(tunnel_path)
+    figure, axes = plt.subplots(figsize=(11, 3), layout="constrained")
+    origin, heading = tunnel["centre"][0], tunnel["tangent"][0]
+    turn = np.array([heading, [-heading[1], heading[0]]])
+    for side in ("left", "right"):
+        wall = tunnel[f"{side}_{lining}"][tunnel[f"{side}_station_{lining}"] < stretch]
+        axes.plot(*(turn @ (wall - origin).T), color=_INK, lw=1.0)
+    axes.plot(*(turn @ (tunnel["centre"][tunnel["station"] < stretch] - origin).T), color=_TRUTH, lw=0.8, ls=":")
+    axes.set(xlabel="m", ylabel="m", aspect="equal")
+    axes.set_title(f"Walls at LiDAR height, {float(tunnel['lidar_height']):g} m above the sleepers ({lining})")
+    axes.grid(alpha=0.3)
+    return figure
 
 
 class Row(NamedTuple):

@@ -37,6 +37,14 @@ def unit_field(field: str) -> str:
     return "shell_unit" if field.startswith(RADIUS) else "unit"
 
 
+def read_fields(path: Path) -> dict[str, np.ndarray]:
+    """Return all fields of a tunnel file by name, those in whole units as the numbers that they stand for."""
+    with np.load(path) as data:
+        fields = {name: data[name] for name in data.files}
+    whole = [name for name, values in fields.items() if values.ndim and values.dtype.kind == "i"]
+    return fields | {name: decode(fields[name], float(fields[unit_field(name)])) for name in whole}
+
+
 def write_tunnel(path: Path, facts: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
     """Write a tunnel file; the same content gives the same bytes.
 

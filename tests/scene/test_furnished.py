@@ -10,7 +10,7 @@ from scene.writing.folder import write_geometry
 from scene.writing.furnished import FurnitureConfig, TunnelSpace, count_pieces, furnish_bore, planar_segments
 from scene.writing.mjcf import SceneConfig
 from scene.writing.track import TrackConfig, lay_track
-from subterra_jax.host.tunnelfile import decode, unit_field
+from subterra_jax.host.tunnelfile import read_fields
 from tests.scene.conftest import arc_bore
 
 WITH_DOOR = FurnitureConfig(passage_spacing=20.0, plate_spacing=6.0)
@@ -36,10 +36,7 @@ def written(level, laid, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def tunnel(written):
-    with np.load(written[0] / "tunnel.npz") as data:
-        fields = {name: data[name] for name in data.files}
-    stored = {name: value for name, value in fields.items() if value.dtype.kind in "iu" and value.ndim}
-    return fields | {name: decode(value, float(fields[unit_field(name)])) for name, value in stored.items()}
+    return read_fields(written[0] / "tunnel.npz")
 
 
 def segments(tunnel, variant: str) -> np.ndarray:

@@ -14,6 +14,7 @@ from benchmarks.fidelity.case import Case, kept_until
 from benchmarks.fidelity.derive import scene
 from benchmarks.fidelity.derive.curve import interpolate_rows
 from benchmarks.fidelity.derive.surface import surface_caster, surface_nearest
+from subterra_jax.host.tunnelfile import read_fields
 
 PROBE_RADIUS = 0.3  # m
 _PROBE_SPACING = 0.5  # m between the stations at which the bore must be free
@@ -194,10 +195,10 @@ def _poses_by_wall(case: Case, model: mujoco.MjModel) -> Float[np.ndarray, "k q"
     station, middle, left = scene.random_stations(case, "mjx_contact_parity", _PLACEMENTS)
     adr = int(model.jnt_qposadr[model.body_jntadr[scene.robot_body(model)]])
     first = model.qpos0[adr : adr + 3]
-    with np.load(case.candidate.tunnel) as tunnel:
-        half = np.interp(station, tunnel["station"], tunnel["half_width"])
-        ground = np.interp(station, tunnel["station"], tunnel["elevation"])
-        start = tunnel["elevation"][np.argmin(np.linalg.norm(tunnel["centre"] - first[:2], axis=1))]
+    tunnel = read_fields(case.candidate.tunnel)
+    half = np.interp(station, tunnel["station"], tunnel["half_width"])
+    ground = np.interp(station, tunnel["station"], tunnel["elevation"])
+    start = tunnel["elevation"][np.argmin(np.linalg.norm(tunnel["centre"] - first[:2], axis=1))]
     lateral = half - _robot_radius(model) + rng.uniform(-_BY_WALL, _BY_WALL, _PLACEMENTS)
     place = middle + (rng.choice([-1.0, 1.0], _PLACEMENTS) * lateral)[:, None] * left
     place[:, 2] = ground + first[2] - start + rng.uniform(*_LIFT, _PLACEMENTS)

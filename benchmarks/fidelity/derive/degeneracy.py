@@ -12,6 +12,7 @@ from benchmarks.fidelity.case import Case, per_case, per_side
 from benchmarks.fidelity.derive import clouds
 from benchmarks.fidelity.derive.beams import returns, sensor_path, side_points
 from benchmarks.fidelity.derive.curve import interpolate_rows
+from subterra_jax.host.tunnelfile import read_fields
 
 _FEWEST_POINTS = 20  # points of a scan
 _EIGEN_FLOOR = 1e-6  # of an eigenvalue; less than the noise of any normal
@@ -142,10 +143,10 @@ def localised_stations(case: Case) -> Bool[np.ndarray, " s"]:
     Shifted along the axis t, a range changes by (n·t)/(n·d) and its distance from the wall by n·t; the standard
     deviation of the shift is σ over the root of the sum of (n·t)² over the beams that return.
     """
-    with np.load(case.candidate.tunnel) as data:
-        lining = "pockets" if "left_pockets" in data else "smooth"
-        walls = [data[f"{side}_{lining}"] for side in ("left", "right")]
-        station, centre, tangent = (data[name] for name in ("station", "centre", "tangent"))
+    data = read_fields(case.candidate.tunnel)
+    lining = "pockets" if "left_pockets" in data else "smooth"
+    walls = [data[f"{side}_{lining}"] for side in ("left", "right")]
+    station, centre, tangent = (data[name] for name in ("station", "centre", "tangent"))
     start, end = (np.concatenate([wall[part] for wall in walls]) for part in (slice(None, -1), slice(1, None)))
     places = np.arange(station[0] + 0.5 * _STATION_SPACING, station[-1], _STATION_SPACING)
     centres, tangents = (interpolate_rows(places, station, rows) for rows in (centre, tangent))

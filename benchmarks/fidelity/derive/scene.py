@@ -24,6 +24,7 @@ from benchmarks.fidelity.derive.mesh import face_parts
 from benchmarks.fidelity.derive.surface import Caster, surface_caster, visible_bodies
 from benchmarks.fidelity.geoms import Geoms, load_model
 from benchmarks.fidelity.meshes import concatenate_meshes, connected_groups
+from subterra_jax.host.tunnelfile import read_fields
 
 
 def per_release(*reads: str) -> Callable[[Function], Function]:
@@ -114,8 +115,8 @@ def robot_body(model: mujoco.MjModel) -> int:
 
 def lidar_elevation(case: Case, station: np.ndarray) -> np.ndarray:
     """Return the height of the environment's LiDAR plane at stations, tunnel frame, m."""
-    with np.load(case.candidate.tunnel) as tunnel:
-        return np.interp(station, tunnel["station"], tunnel["elevation"]) + float(tunnel["lidar_height"])
+    tunnel = read_fields(case.candidate.tunnel)
+    return np.interp(station, tunnel["station"], tunnel["elevation"]) + float(tunnel["lidar_height"])
 
 
 def random_stations(case: Case, id: str, count: int, inset: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -12,6 +12,7 @@ from benchmarks.fidelity.candidate import Candidate
 from benchmarks.fidelity.derive.curve import interpolate_rows
 from benchmarks.fidelity.faults.kinds import Fault, Site, fault_kind
 from benchmarks.fidelity.meshes import without_faces
+from subterra_jax.host.tunnelfile import read_fields
 
 PANELS = ("wall_", "bed_")
 OUTWARD = ("wall_", "low_")
@@ -55,8 +56,7 @@ def scale_scene(candidate: Candidate, factor: float, scratch: Path) -> Candidate
             body.pos = middle + factor * (np.asarray(body.pos) - middle)
 
     edit_scene(copy, change)
-    with np.load(candidate.tunnel) as data:
-        arrays = {name: data[name] for name in data.files}
+    arrays = read_fields(candidate.tunnel)
     for name, value in arrays.items():
         if name in ("station", "half_width") or "station_" in name:
             arrays[name] = value * factor
@@ -119,8 +119,7 @@ def widen_plan(site: Site, fault: Fault) -> Candidate:
     """Moves the walls of the environment's planar tunnel apart, so that it is not the mesh's."""
     wider = fault.size
     copy = copy_scene(site.candidate, site.scratch, lambda file: file.name == "tunnel.npz")
-    with np.load(site.candidate.tunnel) as data:
-        arrays = {name: data[name] for name in data.files}
+    arrays = read_fields(site.candidate.tunnel)
     normal = np.column_stack([-arrays["tangent"][:, 1], arrays["tangent"][:, 0]])
     for side, sign in (("left", 0.5), ("right", -0.5)):
         for lining in arrays["lining"]:

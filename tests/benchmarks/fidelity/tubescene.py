@@ -8,6 +8,7 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from subterra_jax.host.tunnelfile import write_tunnel
 from tests.benchmarks.fidelity.tube import Tube, candidate
 
 LIDAR_HEIGHT = 0.7
@@ -95,9 +96,9 @@ def _plan(path: Path, tube: Tube) -> None:
         side: tube.point(station, sign * half, level + LIDAR_HEIGHT)[:, :2]
         for side, sign in (("left", 1), ("right", -1))
     }
+    facts = {"name": "tube", "provenance": "simulated", "lidar_height": LIDAR_HEIGHT, "lining": ["smooth", "pockets"]}
     fields = {
-        "schema": "subterra.tunnel/3", "name": "tube", "provenance": "simulated", "station": station,
-        "centre": position[:, :2], "half_width": half, "lidar_height": LIDAR_HEIGHT, "lining": ["smooth", "pockets"],
+        "station": station, "centre": position[:, :2], "half_width": half,
         "tangent": tangent[:, :2] / np.linalg.norm(tangent[:, :2], axis=1, keepdims=True),
         "elevation": tube.point(station, np.zeros_like(station), level)[:, 2],
     }  # fmt: skip
@@ -105,4 +106,4 @@ def _plan(path: Path, tube: Tube) -> None:
         fields[f"furniture_{lining}"] = np.empty((0, 4))
         for side, wall in walls.items():
             fields[f"{side}_{lining}"], fields[f"{side}_station_{lining}"] = wall, station
-    np.savez(path, **{name: np.asarray(value) for name, value in fields.items()})
+    write_tunnel(path, facts, fields)  # in whole units, as scenes have it
