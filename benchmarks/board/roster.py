@@ -51,6 +51,7 @@ ROSTER = (
     Entry("StopAt-v1", "learnt", f"{_TRAINED}; its speed, steering and stop by reward", _STOPS, hidden=False),
     Entry("locate-obstructed", "learnt", _TRAINED, ("Obstructed",), hidden=False),
     Entry("locate-faulted", "learnt", _TRAINED, ("Faulted",), hidden=False),
+    Entry("Return-v1", "reward", "`open:…:train`; by reward alone", ("Return",), hidden=False),
     Entry("locate-spin", "learnt", f"{_TRAINED}; reads `spin16x64`", _STOPS, hidden=False, sensor="spin16x64"),
     Entry("nomap:locate-map", "learnt", f"{_TRAINED}; its map is hidden", _STOPS),
     Entry("locate-map", "map", _MAPPED, _STOPS),
