@@ -22,7 +22,7 @@ from subterra_jax.parts import Faults, Imu, Obstacles, Odometer, Part, PlanarLid
 from subterra_jax.parts.odometer import OdometryParams
 from subterra_jax.parts.spatial_lidar import SENSORS, SpatialLidar, SpatialParams, make_sensor
 from subterra_jax.parts.wander import WanderParams
-from subterra_jax.procedural import open_world
+from subterra_jax.procedural import expand, open_world
 from subterra_jax.rules import GoalParams, Relocalise, Rule, StartParams, StopAt, Traverse, TurnBack
 from subterra_jax.rules.rule import ERRANDS
 from subterra_jax.state import EnvParams
@@ -256,6 +256,12 @@ def tunnel_for(
     if spatial:
         return open_world.shortest("train", _QUICKLY_MADE) if split is None else open_world.shortest(split)
     return f"open:{split or 'train'}:0-{N_TUNNELS - 1}"
+
+
+def first_tunnel(id: str, spatial: bool = False) -> str:
+    """Return the first of the tunnels of a task where none is named, for what shows or measures a single one."""
+    usual = tunnel_for(id, spatial=spatial) if id in TASKS else PAPER_TUNNEL
+    return expand(usual)[0] if isinstance(usual, str) else usual[0]
 
 
 def _hidden_start(id: str, overrides: Mapping[str, Any]) -> StartParams:

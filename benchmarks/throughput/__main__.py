@@ -22,6 +22,7 @@ from benchmarks.throughput.peers import measure_jaxnav, require_jaxnav
 from benchmarks.throughput.timing import Timing, measure
 from benchmarks.throughput.variants import measure_lengths, measure_linings
 from subterra_jax.host.files import require_folder
+from subterra_jax.tasks import first_tunnel
 from train import tunnels
 
 _WHOLE = "Subterra/Traverse-v1"  # whose piece is the whole tunnel
@@ -48,7 +49,7 @@ def run_one(config: ThroughputConfig) -> report.Result:
     """Measures in one tunnel, beside JaxNav, and as the tunnel gets longer or rougher."""
     if config.peers == "jaxnav":
         require_jaxnav()
-    plan = st.load_tunnel(config.tunnel)
+    plan = st.load_tunnel(config.tunnel or first_tunnel(config.task))
     lining = config.lining or plan.default_lining
     env, params = st.make(config.task, plan, lining, sensor=config.sensor)
     for name in config.linings:

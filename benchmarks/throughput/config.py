@@ -24,7 +24,7 @@ class ThroughputConfig:
         n: Batch sizes to measure; 1 to 262,144 if not given, on a CPU to 4,096.
         peers: JaxNav beside ours: `auto` (where it is installed), `jaxnav`, or `none`.
         task: Task id.
-        tunnel: Tunnel file, or the name of a packaged one; the packaged default if not given. Several names, as
+        tunnel: Tunnel file or name; the first that the task has by itself if not given. Several names, as
             `open:cast:train:0-9` or with commas between: each episode draws one of them.
         copies: Copies of each tunnel, in memory of their own.
         lining: Variant of the walls; the tunnel's usual one if not given.

@@ -19,7 +19,7 @@ from subterra_jax.lidar3d import beams
 from subterra_jax.parts.spatial_lidar import SENSORS
 from subterra_jax.policies import PREFIX
 from subterra_jax.state import EnvParams
-from subterra_jax.tasks import TASKS, find
+from subterra_jax.tasks import TASKS, find, first_tunnel
 from subterra_jax.tunnel.plan import TunnelPlan
 from subterra_jax.tunnel_env import TunnelEnv
 
@@ -44,7 +44,7 @@ class RecorderConfig:
         policy: Policy that drives instead: a `.safetensors` file, a run folder, or the name of a released one.
         seed: Seed of everything random in the episode.
         episode: Record this one of the task's 500 listed episodes instead (from 0), as the leaderboard drives it.
-        tunnel: Tunnel file or name; the packaged tunnel if left out.
+        tunnel: Tunnel file or name; the first of those that the task has by itself if left out.
         lining: Variant of the walls; `pockets` if left out.
         sensor: The robot's own LiDAR: `planar16`, or `spin16x64`, `vlp16`, `os1-64`, `avia` in three dimensions, whose
             returns are recorded as `/points` in place of `/scan`.
@@ -168,8 +168,9 @@ def open_world(config: RecorderConfig) -> World:
     name = find(config.task, short=True)
     if name not in TASKS:
         raise RecorderError(f"{name} cannot be recorded: the recorder drives robots on wheels")
-    source = config.tunnel if config.scene is None else config.scene / "tunnel.npz"
-    plan = st.load_tunnel(source, solid=config.sensor != SENSORS[0])
+    spatial = config.sensor != SENSORS[0]
+    source = config.tunnel or first_tunnel(name, spatial) if config.scene is None else config.scene / "tunnel.npz"
+    plan = st.load_tunnel(source, solid=spatial)
     try:
         env, params = st.make(name, plan, config.lining, sensor=config.sensor)
     except ValueError as error:

@@ -16,6 +16,7 @@ from subterra_jax.host.loading import load_object
 from subterra_jax.host.task_ids import MISSIONS, WALK
 from subterra_jax.parts.spatial_lidar import SENSORS
 from subterra_jax.policies.opening import FORMS, names_code, policy_source
+from subterra_jax.tasks import first_tunnel
 from subterra_jax.tunnel.plan import TunnelPlan
 from subterra_jax.tunnel.sources import PACKAGED, load_tunnel, tunnel_digest
 from subterra_jax.viewer.config import ViewerConfig, ViewerError
@@ -119,7 +120,8 @@ class Library:
             source = str(config.scene / "tunnel.npz")
             name = f"{load_tunnel(source).name} (scene)"
             self.tunnels[name] = TunnelEntry(name, source, config.scene)
-        for source in (*config.tunnels, *PACKAGED, *_GENERATED):
+        usual = first_tunnel(config.task, spatial=config.sensor != SENSORS[0])
+        for source in (*config.tunnels, usual, *PACKAGED, *_GENERATED):
             self.tunnels.setdefault(source, TunnelEntry(source, source))
         for source in config.tunnels:
             self.plan(source)

@@ -210,7 +210,9 @@ DRIVERS = ("mine.py:Slow", "policy:own.safetensors", "policy:run")
 
 def test_recorder_and_viewer_take_a_file_a_run_folder_and_a_class_of_other_people(places):
     for name in DRIVERS:
-        assert name in library.Library(ViewerConfig(agent=name, recordings=places)).agents
+        shown = library.Library(ViewerConfig(agent=name, recordings=places))
+        assert name in shown.agents
+        assert next(iter(shown.tunnels)) == first_tunnel(ViewerConfig().task) == "open:train:0"
     trace = record(RecorderConfig(out=places / "out", task="TraverseShort", agent="mine.py:Slow", steps=3))
     np.testing.assert_allclose(trace.command[:, 0], 0.7)
 

@@ -12,7 +12,8 @@ BEAMS = 48
 @pytest.fixture(scope="session")
 def config(tmp_path_factory: pytest.TempPathFactory) -> RecorderConfig:
     out: Path = tmp_path_factory.mktemp("episode") / "one"
-    return RecorderConfig(out=out, task="StopAtShort", agent="dead-reckoning", episode=1, imu=True, beams=BEAMS)
+    where = {"task": "StopAtShort", "tunnel": "subterra-351"}
+    return RecorderConfig(out=out, **where, agent="dead-reckoning", episode=1, imu=True, beams=BEAMS)
 
 
 @pytest.fixture(scope="session")

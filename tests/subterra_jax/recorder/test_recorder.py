@@ -141,7 +141,7 @@ def test_the_same_config_gives_the_same_bytes(config, trace, tmp_path):
         (("--seed", "-1"), "error: seed must be at least 0, got -1"),
         (("--cloud", "vlp16"), "error: cloud 'vlp16' needs a scene folder"),
         (("--tunnel", "no.npz"), "error: no.npz: no such tunnel file"),
-        (("--lining", "velvet"), "error: tunnel 'subterra-351' has no lining 'velvet'"),
+        (("--lining", "velvet"), "error: tunnel 'open:train:0' has no lining 'velvet'"),
         (("--scene", "nowhere", "--tunnel", "control"), "error: either scene or tunnel, not both"),
         (("--scene", "nowhere"), "error: nowhere/tunnel.npz: no such tunnel file"),
     ],
