@@ -22,6 +22,7 @@ from subterra_jax.evaluation import Episodes, evaluate
 from subterra_jax.policies import PolicyError, files, load_policy, loading
 from subterra_jax.policies.trained import Trained
 from subterra_jax.recorder import RecorderConfig, record
+from subterra_jax.tasks import first_tunnel
 from subterra_jax.viewer import library
 from subterra_jax.viewer.config import ViewerConfig
 from tests.subterra_jax.probes import PROBES
