@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -56,7 +57,7 @@ def scale_scene(candidate: Candidate, factor: float, scratch: Path) -> Candidate
             body.pos = middle + factor * (np.asarray(body.pos) - middle)
 
     edit_scene(copy, change)
-    arrays = read_fields(candidate.tunnel)
+    arrays: dict[str, Any] = read_fields(candidate.tunnel)
     for name, value in arrays.items():
         if name in ("station", "half_width") or "station_" in name:
             arrays[name] = value * factor
@@ -119,7 +120,7 @@ def widen_plan(site: Site, fault: Fault) -> Candidate:
     """Moves the walls of the environment's planar tunnel apart, so that it is not the mesh's."""
     wider = fault.size
     copy = copy_scene(site.candidate, site.scratch, lambda file: file.name == "tunnel.npz")
-    arrays = read_fields(site.candidate.tunnel)
+    arrays: dict[str, Any] = read_fields(site.candidate.tunnel)
     normal = np.column_stack([-arrays["tangent"][:, 1], arrays["tangent"][:, 0]])
     for side, sign in (("left", 0.5), ("right", -0.5)):
         for lining in arrays["lining"]:
