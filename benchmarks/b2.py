@@ -30,20 +30,13 @@ class Command:
     """Measures physics steps per second of the B2 on its window of track.
 
     Example: python -m benchmarks.b2 --robots 8192
-
-    Attributes:
-        robots: Robots in the batch.
-        tunnel: Tunnel file or name; its length does not change the speed.
-        control_steps: Control periods of 5 physics steps in one timed call.
-        repeats: Timed calls; the median is reported.
-        out: JSON file for the figures.
     """
 
-    robots: int = 8192
-    tunnel: str | None = None
-    control_steps: int = 20
-    repeats: int = 10
-    out: Path | None = None
+    robots: int = 8192  # Robots in the batch.
+    tunnel: str | None = None  # Tunnel file or name; its length does not change the speed.
+    control_steps: int = 20  # Control periods of 5 physics steps in one timed call.
+    repeats: int = 10  # Timed calls; the median is reported.
+    out: Path | None = None  # JSON file for the figures.
 
 
 def measure(command: Command) -> dict[str, Any]:

@@ -28,36 +28,23 @@ class Command:
     """Lets B2s traverse a tunnel.
 
     Example: python -m benchmarks.b2_traverse --robots 100 --agent B2Traverse-v1 --engine mujoco
-
-    Attributes:
-        robots: Number of robots.
-        seed: Seed for their draws.
-        agent: Driver: a baseline, a run folder of `train --embodiment b2`, a policy's file or name, or code as
-            `FILE.py:Class`.
-        policy: Gait: a file, the name of a released gait, or `trot`.
-        engine: `mjx`, or `mujoco` in C on the host.
-        tunnel: Tunnel file or name; the packaged tunnel if not given.
-        scene: Built scene folder, instead of a tunnel.
-        length: Length of the tunnel to use, m; 0 is all of it. A policy trained on all of it has never been near a far
-            mouth; for a short trial, lower `coverage` instead.
-        coverage: Share of the tunnel that counts as success.
-        odometer: `legs`, the robot's own, or `drift`.
-        speed: Largest commanded speed, m/s.
-        out: JSON file for the figures.
     """
 
-    robots: int = 100
-    seed: int = 0
+    robots: int = 100  # Number of robots.
+    seed: int = 0  # Seed for their draws.
+    # Driver: a baseline, a run folder of `train --embodiment b2`, a policy's file or name, or code as `FILE.py:Class`.
     agent: str = "dead-reckoning"
-    policy: str = RELEASED
-    engine: Literal["mjx", "mujoco"] = "mjx"
-    tunnel: str | None = None
-    scene: Path | None = None
+    policy: str = RELEASED  # Gait: a file, the name of a released gait, or `trot`.
+    engine: Literal["mjx", "mujoco"] = "mjx"  # `mjx`, or `mujoco` in C on the host.
+    tunnel: str | None = None  # Tunnel file or name; the packaged tunnel if not given.
+    scene: Path | None = None  # Built scene folder, instead of a tunnel.
+    # Length of the tunnel to use, m; 0 is all of it. A policy trained on all of it has never been near a far mouth; for
+    # a short trial, lower `coverage` instead.
     length: float = 0.0
-    coverage: float = 0.9
-    odometer: Literal["legs", "drift"] = "legs"
-    speed: float = tasks.VEHICLE.speed_max
-    out: Path | None = None
+    coverage: float = 0.9  # Share of the tunnel that counts as success.
+    odometer: Literal["legs", "drift"] = "legs"  # `legs`, the robot's own, or `drift`.
+    speed: float = tasks.VEHICLE.speed_max  # Largest commanded speed, m/s.
+    out: Path | None = None  # JSON file for the figures.
 
 
 def show_progress(now: transfer.Walk) -> None:

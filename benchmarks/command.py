@@ -48,17 +48,11 @@ def run_main(
 
 
 class Ran(NamedTuple):
-    """End of a command.
+    """End of a command."""
 
-    Attributes:
-        status: Exit status.
-        message: Where it failed, the last line of its log, which is the sentence of an error; empty where it did not.
-        memory: Peak memory, GiB.
-    """
-
-    status: int
-    message: str
-    memory: float
+    status: int  # Exit status
+    message: str  # Where it failed, the last line of its log, which is the sentence of an error; empty where it did not
+    memory: float  # Peak memory, GiB
 
 
 def run_module(module: str, *words: object, log: Path | None = None) -> Ran:

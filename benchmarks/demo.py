@@ -25,18 +25,12 @@ class DemoConfig:
     """Survey → bag → scene → MuJoCo and MJX → training on the reconstructed bore → report.
 
     Example: python -m benchmarks.demo --length 60 --out out/demo
-
-    Attributes:
-        out: Output folder.
-        length: Length of the simulated tunnel, m.
-        seed: Seed for survey and training.
-        point_rate: Points per second of the simulated LiDAR.
     """
 
-    out: Path = Path("out/demo")
-    length: float = 60.0
-    seed: int = 0
-    point_rate: int = 240_000
+    out: Path = Path("out/demo")  # Output folder.
+    length: float = 60.0  # Length of the simulated tunnel, m.
+    seed: int = 0  # Seed for survey and training.
+    point_rate: int = 240_000  # Points per second of the simulated LiDAR.
 
 
 @contextmanager

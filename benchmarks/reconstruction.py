@@ -33,20 +33,14 @@ class ReconstructionConfig:
     """Simulates surveys, builds scenes and compares them with the truth.
 
     The builder reads the Avia; the OS1 on the same rack is held out.
-
-    Attributes:
-        seeds: Seeds for the surveys.
-        length: Length of each bore, m.
-        truth: Kind of bore; see `python -m scene.survey --help`.
-        poses: `given`: true poses; `control`: odometry, IMU and prism.
-        out: Output folder; surveys in it are not simulated again.
     """
 
-    seeds: tuple[int, ...] = (201, 202)
-    length: float = 60.0
-    truth: str = "paper"
+    seeds: tuple[int, ...] = (201, 202)  # Seeds for the surveys.
+    length: float = 60.0  # Length of each bore, m.
+    truth: str = "paper"  # Kind of bore; see `python -m scene.survey --help`.
+    # `given`: true poses; `control`: odometry, IMU and prism.
     poses: tuple[Literal["given", "control"], ...] = ("given", "control")
-    out: Path = Path("out/reconstruction")
+    out: Path = Path("out/reconstruction")  # Output folder; surveys in it are not simulated again.
 
 
 class Figure(NamedTuple):

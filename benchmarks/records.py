@@ -33,39 +33,23 @@ _ID = re.compile(r"[\w.+-]+(/[\w.+-]+)+")
 
 @dataclasses.dataclass(frozen=True)
 class Record:
-    """One figure and where it comes from.
+    """One figure and where it comes from."""
 
-    Attributes:
-        id: Its name, `FAMILY/…/QUANTITY`.
-        value: The figure, rounded to the digits that are shown.
-        unit: Its unit; empty for a pure number.
-        interval: Its 95 % interval; None where none was determined.
-        n: Episodes, surveys or runs behind it; None for a single measurement.
-        split: Tunnels, scenes or seeds that it was measured on, in words.
-        seed: Seed of the measurement; None where there are several or none.
-        hardware: Machine.
-        versions: Versions of Python and packages.
-        date: Day of the measurement.
-        command: Words after `python -m`.
-        commit: Commit that was measured; `unknown` where it was not kept, as before 26 November 2026.
-        bound: Whether a measurement again must be near it, or may be larger (`at least`) or smaller (`at most`).
-        tolerance: Difference in the wrong direction that is none, in its unit.
-    """
-
-    id: str
-    value: float
-    unit: str
-    interval: tuple[float, float] | None
-    n: int | None
-    split: str
-    seed: int | None
-    hardware: str
-    versions: dict[str, str]
-    date: str
-    command: str
-    commit: str
+    id: str  # Its name, `FAMILY/…/QUANTITY`
+    value: float  # The figure, rounded to the digits that are shown
+    unit: str  # Its unit; empty for a pure number
+    interval: tuple[float, float] | None  # Its 95 % interval; None where none was determined
+    n: int | None  # Episodes, surveys or runs behind it; None for a single measurement
+    split: str  # Tunnels, scenes or seeds that it was measured on, in words
+    seed: int | None  # Seed of the measurement; None where there are several or none
+    hardware: str  # Machine
+    versions: dict[str, str]  # Versions of Python and packages
+    date: str  # Day of the measurement
+    command: str  # Words after `python -m`
+    commit: str  # Commit that was measured; `unknown` where it was not kept, as before 26 November 2026
+    # Whether a measurement again must be near it, or may be larger (`at least`) or smaller (`at most`)
     bound: Literal["near", "at least", "at most"] = "near"
-    tolerance: float = 0.0
+    tolerance: float = 0.0  # Difference in the wrong direction that is none, in its unit
 
     def holds(self, measured: float) -> bool:
         """Tell whether a measurement agrees with it."""

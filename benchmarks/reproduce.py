@@ -20,21 +20,14 @@ from subterra_jax.host.files import require_folder
 
 
 class Job(NamedTuple):
-    """Commands that measure records on a CPU.
+    """Commands that measure records on a CPU."""
 
-    Attributes:
-        commands: Words after `python -m`; `{out}` is the job's folder, `{shared}` that of surveys not packaged.
-        minutes: Duration on two idle cores, minutes.
-        records: File below the job's folder that holds the records once it is done.
-        needs: Path that must exist, or empty.
-        read: Reads the figures by id where the command writes none.
-    """
-
+    # Words after `python -m`; `{out}` is the job's folder, `{shared}` that of surveys not packaged
     commands: tuple[str, ...]
-    minutes: float
-    records: str = "records.json"
-    needs: str = ""
-    read: Callable[[Any], dict[str, float]] | None = None
+    minutes: float  # Duration on two idle cores, minutes
+    records: str = "records.json"  # File below the job's folder that holds the records once it is done
+    needs: str = ""  # Path that must exist, or empty
+    read: Callable[[Any], dict[str, float]] | None = None  # Reads the figures by id where the command writes none
 
 
 def _verdict(report: Any) -> dict[str, float]:
@@ -72,17 +65,11 @@ JOBS = {
 
 @dataclass(frozen=True)
 class ReproduceConfig:
-    """Settings of a reproduction.
+    """Settings of a reproduction."""
 
-    Attributes:
-        jobs: Measurements to make.
-        out: Folder for results; finished jobs in it are not run again.
-        shared: Folder that holds surveys that are not packaged.
-    """
-
-    jobs: tuple[str, ...] = tuple(name for name, job in JOBS.items() if job.minutes <= 15.0)
-    out: Path = Path("out/reproduce")
-    shared: Path = Path("../shared")
+    jobs: tuple[str, ...] = tuple(name for name, job in JOBS.items() if job.minutes <= 15.0)  # Measurements to make.
+    out: Path = Path("out/reproduce")  # Folder for results; finished jobs in it are not run again.
+    shared: Path = Path("../shared")  # Folder that holds surveys that are not packaged.
 
 
 def run_job(job: Job, folder: Path, shared: Path) -> dict[str, float] | None:

@@ -17,40 +17,24 @@ _FINE = 0.01  # m between points where the nearest one is looked up
 
 @dataclass(frozen=True)
 class Truth:
-    """True centreline and section sizes in the survey frame.
+    """True centreline and section sizes in the survey frame."""
 
-    Attributes:
-        station: Stations, m.
-        position: Points of the centreline, m.
-        width: Largest inner width, m.
-        height: Floor to crown on the axis, m.
-    """
-
-    station: Float[np.ndarray, " n"]
-    position: Float[np.ndarray, "n 3"]
-    width: Float[np.ndarray, " n"]
-    height: Float[np.ndarray, " n"]
+    station: Float[np.ndarray, " n"]  # Stations, m
+    position: Float[np.ndarray, "n 3"]  # Points of the centreline, m
+    width: Float[np.ndarray, " n"]  # Largest inner width, m
+    height: Float[np.ndarray, " n"]  # Floor to crown on the axis, m
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Errors of a bore against the truth, station by station.
+    """Errors of a bore against the truth, station by station."""
 
-    Attributes:
-        station: True station of each compared section, m.
-        lateral: Offset of the axis to the left, m.
-        vertical: Offset upwards, m.
-        width: Width error, m.
-        height: Height error, m.
-        length_error: Reconstructed less true length, m.
-    """
-
-    station: Float[np.ndarray, " k"]
-    lateral: Float[np.ndarray, " k"]
-    vertical: Float[np.ndarray, " k"]
-    width: Float[np.ndarray, " k"]
-    height: Float[np.ndarray, " k"]
-    length_error: float
+    station: Float[np.ndarray, " k"]  # True station of each compared section, m
+    lateral: Float[np.ndarray, " k"]  # Offset of the axis to the left, m
+    vertical: Float[np.ndarray, " k"]  # Offset upwards, m
+    width: Float[np.ndarray, " k"]  # Width error, m
+    height: Float[np.ndarray, " k"]  # Height error, m
+    length_error: float  # Reconstructed less true length, m
 
     def figures(self) -> dict[str, float]:
         """Returns the errors as single numbers, m."""

@@ -30,23 +30,14 @@ _progress = Console(stderr=True, highlight=False)
 
 @dataclasses.dataclass(frozen=True)
 class AgainConfig:
-    """Settings of a check.
+    """Settings of a check."""
 
-    Attributes:
-        out: Folder for `again.json`, a line for each cell.
-        cells: File of the cells.
-        tasks: Tasks of the cells to drive; all if not given.
-        agents: Agents of the cells to drive; all if not given.
-        episodes: Episodes of each cell, spread evenly over its tunnels.
-        cache: Folder in which made tunnels are kept from run to run.
-    """
-
-    out: Path
-    cells: Path = ON_RECORD
-    tasks: tuple[str, ...] = ()
-    agents: tuple[str, ...] = ()
-    episodes: int = 20
-    cache: Path | None = None
+    out: Path  # Folder for `again.json`, a line for each cell.
+    cells: Path = ON_RECORD  # File of the cells.
+    tasks: tuple[str, ...] = ()  # Tasks of the cells to drive; all if not given.
+    agents: tuple[str, ...] = ()  # Agents of the cells to drive; all if not given.
+    episodes: int = 20  # Episodes of each cell, spread evenly over its tunnels.
+    cache: Path | None = None  # Folder in which made tunnels are kept from run to run.
 
 
 def run(config: AgainConfig) -> int:

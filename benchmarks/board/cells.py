@@ -23,25 +23,15 @@ _AGENTS = tuple(entry.name for entry in ROSTER)
 
 @dataclasses.dataclass(frozen=True)
 class Score:
-    """Success of an agent in one column, or over several.
+    """Success of an agent in one column, or over several."""
 
-    Attributes:
-        success: Share of the episodes, 0 to 1.
-        low: Lower end of its 95 % interval, by a bootstrap within tunnels.
-        high: Upper end.
-        contact: Share of the episodes that end at a wall or a box.
-        median_error: Median distance from the goal at the stop, m; None where nobody stopped.
-        floor: Success that theory allows without a look at the walls; None where it is not known.
-        n: Episodes.
-    """
-
-    success: float
-    low: float
-    high: float
-    contact: float
-    median_error: float | None
-    floor: float | None
-    n: int
+    success: float  # Share of the episodes, 0 to 1
+    low: float  # Lower end of its 95 % interval, by a bootstrap within tunnels
+    high: float  # Upper end
+    contact: float  # Share of the episodes that end at a wall or a box
+    median_error: float | None  # Median distance from the goal at the stop, m; None where nobody stopped
+    floor: float | None  # Success that theory allows without a look at the walls; None where it is not known
+    n: int  # Episodes
 
 
 Key = tuple[str, str]  # split, kind

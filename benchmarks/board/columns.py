@@ -18,28 +18,18 @@ _SEED = "subterra.openboard/1"  # of the episodes; the schema of the first cells
 
 @dataclasses.dataclass(frozen=True)
 class Column:
-    """One kind of lining in one split, or one further tunnel.
+    """One kind of lining in one split, or one further tunnel."""
 
-    Attributes:
-        kind: Kind of lining, or the tunnel's name.
-        split: Split of the open world, or `OWN`.
-    """
-
-    kind: str
-    split: str
+    kind: str  # Kind of lining, or the tunnel's name
+    split: str  # Split of the open world, or `OWN`
 
 
 @dataclasses.dataclass(frozen=True)
 class Setting:
-    """What is driven.
+    """What is driven."""
 
-    Attributes:
-        task: A task of the benchmark without `Subterra/` and version, or the id of one's own.
-        hidden_start: Whether the start that is given is wrong by an unknown amount.
-    """
-
-    task: str
-    hidden_start: bool = False
+    task: str  # A task of the benchmark without `Subterra/` and version, or the id of one's own
+    hidden_start: bool = False  # Whether the start that is given is wrong by an unknown amount
 
     @property
     def words(self) -> str:

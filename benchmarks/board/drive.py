@@ -37,41 +37,27 @@ _progress = Console(stderr=True, highlight=False)
 
 @dataclasses.dataclass(frozen=True)
 class BoardConfig:
-    """Settings of the board.
+    """Settings of the board."""
 
-    Attributes:
-        out: Folder for the cells, `board.md`, `board.png` and `records.json`.
-        tasks: Tasks, as `StopAt`, `Subterra/StopAt-v1` or `FILE.py:ID` of one's own.
-        start: Whether the start is `given`, as tasks do, `hidden`, or one after the other where a task has both.
-        agents: Agents by name; policies by name, file or run folder; code as `module:Class` or `FILE.py:Class`;
-            `cut:` and `nomap:` before a learnt localiser take away what its walls tell, or its map. All of the
-            roster if not given.
-        splits: Splits of the open world; a choice may be made on `val` alone.
-        episodes: Episodes of each kind and split.
-        tunnels: Tunnels of each kind and split, over which the episodes are spread.
-        further: Names or files of further tunnels, a column each.
-        sensor: The LiDAR of agents without a line in the roster, by name.
-        load: Python files to run first, which register tasks, agents or kinds of one's own.
-        memory: Memory that driving may take at once, GB; an agent that needs more is driven in parts of the episodes.
-        cache: Folder in which made tunnels are kept from run to run.
-        report_only: Drive nothing.
-        cells: File of cells to report in place of those in `out`, with `report_only`.
-    """
-
-    out: Path
-    tasks: tuple[str, ...] = TASKS
+    out: Path  # Folder for the cells, `board.md`, `board.png` and `records.json`.
+    tasks: tuple[str, ...] = TASKS  # Tasks, as `StopAt`, `Subterra/StopAt-v1` or `FILE.py:ID` of one's own.
+    # Whether the start is `given`, as tasks do, `hidden`, or one after the other where a task has both.
     start: Literal["given", "hidden", "both"] = "both"
+    # Agents by name; policies by name, file or run folder; code as `module:Class` or `FILE.py:Class`; `cut:` and
+    # `nomap:` before a learnt localiser take away what its walls tell, or its map. All of the roster if not given.
     agents: tuple[str, ...] = ()
+    # Splits of the open world; a choice may be made on `val` alone.
     splits: tuple[str, ...] = ("val", "test-seen", "test-unseen")
-    episodes: int = 50
-    tunnels: int = 5
-    further: tuple[str, ...] = ()
-    sensor: str = PLANAR
-    load: tuple[Path, ...] = ()
+    episodes: int = 50  # Episodes of each kind and split.
+    tunnels: int = 5  # Tunnels of each kind and split, over which the episodes are spread.
+    further: tuple[str, ...] = ()  # Names or files of further tunnels, a column each.
+    sensor: str = PLANAR  # The LiDAR of agents without a line in the roster, by name.
+    load: tuple[Path, ...] = ()  # Python files to run first, which register tasks, agents or kinds of one's own.
+    # Memory that driving may take at once, GB; an agent that needs more is driven in parts of the episodes.
     memory: float = 8.0
-    cache: Path | None = None
-    report_only: bool = False
-    cells: Path | None = None
+    cache: Path | None = None  # Folder in which made tunnels are kept from run to run.
+    report_only: bool = False  # Drive nothing.
+    cells: Path | None = None  # File of cells to report in place of those in `out`, with `report_only`.
 
 
 @dataclasses.dataclass(frozen=True)

@@ -31,21 +31,13 @@ _progress = Console(stderr=True, highlight=False)
 
 @dataclass(frozen=True)
 class JudgeConfig:
-    """Builds each cloud of a folder and judges it by the truth beside it.
+    """Builds each cloud of a folder and judges it by the truth beside it."""
 
-    Attributes:
-        folder: Folder with inputs and their `NAME_truth.npz`.
-        out: Folder for results and logs; cases with a result there are not built again.
-        only: Beginnings of the names of the cases wanted; all if not given.
-        flags: Further words for the builder, in one string.
-        keep: Keep the scenes in `OUT/scenes`.
-    """
-
-    folder: Annotated[Path, tyro.conf.Positional]
-    out: Path
-    only: tuple[str, ...] = ()
-    flags: str = ""
-    keep: bool = False
+    folder: Annotated[Path, tyro.conf.Positional]  # Folder with inputs and their `NAME_truth.npz`.
+    out: Path  # Folder for results and logs; cases with a result there are not built again.
+    only: tuple[str, ...] = ()  # Beginnings of the names of the cases wanted; all if not given.
+    flags: str = ""  # Further words for the builder, in one string.
+    keep: bool = False  # Keep the scenes in `OUT/scenes`.
 
 
 def judge(config: JudgeConfig) -> None:

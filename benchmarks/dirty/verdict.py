@@ -38,17 +38,11 @@ TOLD_BY: dict[str, tuple[Code, ...]] = {
 
 @dataclass(frozen=True)
 class Fault:
-    """Faults of a built scene beyond the tolerances.
+    """Faults of a built scene beyond the tolerances."""
 
-    Attributes:
-        kind: A key of `TOLD_BY`.
-        text: It in a few words.
-        place: True station, m; NaN where it has none.
-    """
-
-    kind: str
-    text: str
-    place: float = math.nan
+    kind: str  # A key of `TOLD_BY`
+    text: str  # It in a few words
+    place: float = math.nan  # True station, m; NaN where it has none
 
 
 def list_faults(row: dict[str, Any], truth: Truth) -> list[Fault]:

@@ -33,24 +33,17 @@ _progress = Console(stderr=True, highlight=False)
 
 @dataclasses.dataclass(frozen=True)
 class AtlasConfig:
-    """Settings of an atlas.
+    """Settings of an atlas."""
 
-    Attributes:
-        tunnel: Folder of a built scene, a `tunnel.npz`, or a name as for `st.load_tunnel`.
-        linings: Variants of the walls; all that the tunnel has if not given.
-        sensors: `planar`, and `spin16x64` (16 rings from -15° to 15°, 64 columns), which needs the bore in three
-            dimensions; where a file holds none, its walls stand upright.
-        task: Task whose noise, range and errors of odometry count.
-        step: Length of a cell of station, m.
-        out: Folder for `atlas.json` and `atlas.png`; `None` prints the summary only.
-    """
-
+    # Folder of a built scene, a `tunnel.npz`, or a name as for `st.load_tunnel`.
     tunnel: Annotated[str, tyro.conf.Positional]
-    linings: tuple[str, ...] = ()
+    linings: tuple[str, ...] = ()  # Variants of the walls; all that the tunnel has if not given.
+    # `planar`, and `spin16x64` (16 rings from -15° to 15°, 64 columns), which needs the bore in three dimensions; where
+    # a file holds none, its walls stand upright.
     sensors: tuple[str, ...] = ("planar",)
-    task: str = "Subterra/StopAt-v1"
-    step: float = 0.5
-    out: Path | None = None
+    task: str = "Subterra/StopAt-v1"  # Task whose noise, range and errors of odometry count.
+    step: float = 0.5  # Length of a cell of station, m.
+    out: Path | None = None  # Folder for `atlas.json` and `atlas.png`; `None` prints the summary only.
 
 
 def run(config: AtlasConfig) -> None:

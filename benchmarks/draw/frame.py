@@ -15,38 +15,23 @@ from scene.reading.times import Scan
 
 @dataclass(frozen=True)
 class Stretch:
-    """A piece of the bore where a frame may be taken.
+    """A piece of the bore where a frame may be taken."""
 
-    Attributes:
-        position: Its middle in the tunnel frame, m.
-        axis: Unit vector along the bore.
-        radius: Largest distance of a frame from `position`, m.
-    """
-
-    position: Float[np.ndarray, "3"]
-    axis: Float[np.ndarray, "3"]
-    radius: float
+    position: Float[np.ndarray, "3"]  # Its middle in the tunnel frame, m
+    axis: Float[np.ndarray, "3"]  # Unit vector along the bore
+    radius: float  # Largest distance of a frame from `position`, m
 
 
 @dataclass(frozen=True)
 class Frame:
-    """Returns of a short time, in the tunnel frame.
+    """Returns of a short time, in the tunnel frame."""
 
-    Attributes:
-        position: LiDAR position in the middle of that time, m.
-        origin: LiDAR position at each return, m.
-        points: Returns, m.
-        single: Rows of the scan in the middle.
-        topic: Topic of the recording.
-        duration: Length of the frame, s.
-    """
-
-    position: Float[np.ndarray, "3"]
-    origin: Float[np.ndarray, "n 3"]
-    points: Float[np.ndarray, "n 3"]
-    single: slice
-    topic: str
-    duration: float
+    position: Float[np.ndarray, "3"]  # LiDAR position in the middle of that time, m
+    origin: Float[np.ndarray, "n 3"]  # LiDAR position at each return, m
+    points: Float[np.ndarray, "n 3"]  # Returns, m
+    single: slice  # Rows of the scan in the middle
+    topic: str  # Topic of the recording
+    duration: float  # Length of the frame, s
 
 
 def load_frame(

@@ -28,19 +28,14 @@ _INK, _PLANE, _POCKET, _BOX = "#222222", "#c1121f", "#1b4965", "#e09f3e"
 
 @dataclasses.dataclass(frozen=True)
 class KindsConfig:
-    """Settings of the pictures.
+    """Settings of the pictures."""
 
-    Attributes:
-        kinds: Kinds of lining, `FILE.py:NAME` for one of your own; all of the benchmark if not given.
-        index: Index of the tunnel in its split; the default lies behind every tunnel that results are made with.
-        length: Length of tunnel to draw, m.
-        out: Folder for a PNG of each kind.
-    """
-
+    # Kinds of lining, `FILE.py:NAME` for one of your own; all of the benchmark if not given.
     kinds: tuple[str, ...] = ()
+    # Index of the tunnel in its split; the default lies behind every tunnel that results are made with.
     index: int = 900_010
-    length: float = 40.0
-    out: Path = Path("out/linings")
+    length: float = 40.0  # Length of tunnel to draw, m.
+    out: Path = Path("out/linings")  # Folder for a PNG of each kind.
 
 
 def run(config: KindsConfig) -> None:

@@ -52,19 +52,12 @@ _LARGEST = 9  # pixels across a drawn return, at most
 
 @dataclass(frozen=True)
 class PaperConfig:
-    """Draws the paper's figures as PDF and PNG, with captions and numbers in `figures.json`.
+    """Draws the paper's figures as PDF and PNG, with captions and numbers in `figures.json`."""
 
-    Attributes:
-        survey: Folder of a simulated survey with the sensors Avia and OS1, for figures 1 to 3.
-        scene: Scene folder built from its `survey.bag`; the OS1 is held out.
-        runs: Folder with run folders `seed-*` of `train`, for figure 4.
-        out: Output folder.
-    """
-
-    survey: Path | None = None
-    scene: Path | None = None
-    runs: Path | None = None
-    out: Path = Path("out/figures")
+    survey: Path | None = None  # Folder of a simulated survey with the sensors Avia and OS1, for figures 1 to 3.
+    scene: Path | None = None  # Scene folder built from its `survey.bag`; the OS1 is held out.
+    runs: Path | None = None  # Folder with run folders `seed-*` of `train`, for figure 4.
+    out: Path = Path("out/figures")  # Output folder.
 
 
 @dataclass(frozen=True)

@@ -20,21 +20,13 @@ Picture = UInt8[np.ndarray, "height width 3"]
 
 @dataclass(frozen=True)
 class Pose:
-    """Pose and size of an upright pinhole camera.
+    """Pose and size of an upright pinhole camera."""
 
-    Attributes:
-        position: Position in the tunnel frame, m.
-        ahead: Unit vector of its optical axis, not vertical.
-        fov: Vertical field of view, rad.
-        width: Width, pixels.
-        height: Height, pixels.
-    """
-
-    position: Float[np.ndarray, "3"]
-    ahead: Float[np.ndarray, "3"]
-    fov: float
-    width: int
-    height: int
+    position: Float[np.ndarray, "3"]  # Position in the tunnel frame, m
+    ahead: Float[np.ndarray, "3"]  # Unit vector of its optical axis, not vertical
+    fov: float  # Vertical field of view, rad
+    width: int  # Width, pixels
+    height: int  # Height, pixels
 
     @property
     def axes(self) -> Float[np.ndarray, "3 3"]:
@@ -54,26 +46,16 @@ class RenderConfig:
     """Renders a scene as one of its cameras, or a camera anywhere, sees it.
 
     Example: python -m benchmarks.draw scene build/tunnel --camera chase --out view.png
-
-    Attributes:
-        scene: Scene folder, or an MJCF file.
-        out: PNG file to write.
-        camera: Camera of the scene: scout, chase, portal_start, middle, wall or portal_end.
-        at: Position of a camera of your own in place of it, tunnel frame, m.
-        ahead: Its viewing direction, of any length.
-        fov_deg: Its vertical field of view, degrees.
-        width: Width, 1 to 8192 pixels.
-        height: Height, 1 to 8192 pixels.
     """
 
-    scene: tyro.conf.Positional[Path]
-    out: Path = Path("view.png")
-    camera: str = "scout"
-    at: tuple[float, float, float] | None = None
-    ahead: tuple[float, float, float] = (1.0, 0.0, 0.0)
-    fov_deg: float = 60.0
-    width: int = 960
-    height: int = 540
+    scene: tyro.conf.Positional[Path]  # Scene folder, or an MJCF file.
+    out: Path = Path("view.png")  # PNG file to write.
+    camera: str = "scout"  # Camera of the scene: scout, chase, portal_start, middle, wall or portal_end.
+    at: tuple[float, float, float] | None = None  # Position of a camera of your own in place of it, tunnel frame, m.
+    ahead: tuple[float, float, float] = (1.0, 0.0, 0.0)  # Its viewing direction, of any length.
+    fov_deg: float = 60.0  # Its vertical field of view, degrees.
+    width: int = 960  # Width, 1 to 8192 pixels.
+    height: int = 540  # Height, 1 to 8192 pixels.
 
 
 def picture(scene: Path, camera: str | Pose, width: int = 960, height: int = 540) -> Picture:

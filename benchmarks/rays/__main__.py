@@ -32,23 +32,14 @@ _progress = Console(stderr=True, highlight=False)
 
 @dataclasses.dataclass(frozen=True)
 class RaysConfig:
-    """Settings of a comparison. Exit status 1: a goal is missed; 2: the comparison cannot be made.
+    """Settings of a comparison. Exit status 1: a goal is missed; 2: the comparison cannot be made."""
 
-    Attributes:
-        scene: Folder of a built scene.
-        n: Rays in each comparison.
-        linings: Variants of the walls; all that have a mesh if not given.
-        kinds: LiDARs to compare.
-        seed: Seed for poses and beams.
-        out: JSON file to write, and `records.json` beside it.
-    """
-
-    scene: Path = DEFAULT_SCENE
-    n: int = 200_000
-    linings: tuple[str, ...] = ()
-    kinds: tuple[str, ...] = ("planar", "3d")
-    seed: int = 0
-    out: Path | None = None
+    scene: Path = DEFAULT_SCENE  # Folder of a built scene.
+    n: int = 200_000  # Rays in each comparison.
+    linings: tuple[str, ...] = ()  # Variants of the walls; all that have a mesh if not given.
+    kinds: tuple[str, ...] = ("planar", "3d")  # LiDARs to compare.
+    seed: int = 0  # Seed for poses and beams.
+    out: Path | None = None  # JSON file to write, and `records.json` beside it.
 
 
 def run(config: RaysConfig) -> tuple[list[Agreement], dict[str, float]]:

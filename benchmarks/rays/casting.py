@@ -69,27 +69,16 @@ _WORST = 10
 
 @dataclasses.dataclass(frozen=True)
 class Agreement:
-    """One comparison of ranges with those of a reference.
+    """One comparison of ranges with those of a reference."""
 
-    Attributes:
-        title: The two things compared.
-        error: Absolute differences, m, `(k,)`.
-        edge: True for rays that pass an edge, `(k,)`.
-        range: Ranges of the reference, m, `(k,)`.
-        station: Station of the LiDAR, m, `(k,)`.
-        judged: True where the goals apply.
-        median_goal: Half of all rays must be within this, m.
-        tail_goal: 99.9 % must be within this, m.
-    """
-
-    title: str
-    error: Float[np.ndarray, "k"]
-    edge: Bool[np.ndarray, "k"]
-    range: Float[np.ndarray, "k"]
-    station: Float[np.ndarray, "k"]
-    judged: bool = True
-    median_goal: float = MEDIAN_GOAL
-    tail_goal: float = TAIL_GOAL
+    title: str  # The two things compared
+    error: Float[np.ndarray, "k"]  # Absolute differences, m, `(k,)`
+    edge: Bool[np.ndarray, "k"]  # True for rays that pass an edge, `(k,)`
+    range: Float[np.ndarray, "k"]  # Ranges of the reference, m, `(k,)`
+    station: Float[np.ndarray, "k"]  # Station of the LiDAR, m, `(k,)`
+    judged: bool = True  # True where the goals apply
+    median_goal: float = MEDIAN_GOAL  # Half of all rays must be within this, m
+    tail_goal: float = TAIL_GOAL  # 99.9 % must be within this, m
 
     @property
     def holds(self) -> bool:
@@ -199,19 +188,12 @@ _ASIDE = 0.7  # largest lateral offset of a sensor, share of the half-width
 
 @dataclasses.dataclass(frozen=True)
 class Scans:
-    """Poses and beams, float32.
+    """Poses and beams, float32."""
 
-    Attributes:
-        position: Sensor positions, m, `(n, 3)`.
-        orientation: Quaternions, w first, `(n, 4)`.
-        station: Stations of the sensors, m, `(n,)`.
-        beam: Unit vectors of the beams in the sensor frame, `(m, 3)`.
-    """
-
-    position: np.ndarray
-    orientation: np.ndarray
-    station: np.ndarray
-    beam: np.ndarray
+    position: np.ndarray  # Sensor positions, m, `(n, 3)`
+    orientation: np.ndarray  # Quaternions, w first, `(n, 4)`
+    station: np.ndarray  # Stations of the sensors, m, `(n,)`
+    beam: np.ndarray  # Unit vectors of the beams in the sensor frame, `(m, 3)`
 
     def directions(self, axis: str = "z", turn: float = 0.0) -> np.ndarray:
         """Returns the directions of all beams, each turned about an axis of the sensor by `turn` rad, `(n·m, 3)`."""

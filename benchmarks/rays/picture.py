@@ -26,21 +26,13 @@ _DOTS = 4_000  # beams of a sensor without rows that are drawn
 
 @dataclasses.dataclass(frozen=True)
 class PictureConfig:
-    """Settings.
+    """Settings."""
 
-    Attributes:
-        tunnel: Name or file of a tunnel.
-        lining: Variant of its walls.
-        station: Place of the robot, m.
-        seed: Seed of the noise.
-        out: The picture, `.png`.
-    """
-
-    out: Path
-    tunnel: str = "metro"
-    lining: str = "pockets"
-    station: float = 40.0
-    seed: int = 0
+    out: Path  # The picture, `.png`.
+    tunnel: str = "metro"  # Name or file of a tunnel.
+    lining: str = "pockets"  # Variant of its walls.
+    station: float = 40.0  # Place of the robot, m.
+    seed: int = 0  # Seed of the noise.
 
 
 def main(config: PictureConfig) -> None:

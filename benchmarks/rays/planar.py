@@ -115,20 +115,14 @@ def simulate(tunnel: Tunnel, poses: Poses, params: lidar.LidarParams, batch: int
 
 @dataclasses.dataclass(frozen=True)
 class Agreement:
-    """Agreement of ranges with the reference.
+    """Agreement of ranges with the reference."""
 
-    Attributes:
-        n_rays: Rays compared.
-        max_error: Largest error of the rays that are not ambiguous, m.
-        n_ambiguous: Rays off by more than the tolerance whose range the reference itself gives when they are turned by
-            up to 3e-6 rad: they pass an edge, or graze a wall, more closely than float32 can say.
-        n_wrong: Rays off by more than the tolerance for no such reason.
-    """
-
-    n_rays: int
-    max_error: float
+    n_rays: int  # Rays compared
+    max_error: float  # Largest error of the rays that are not ambiguous, m
+    # Rays off by more than the tolerance whose range the reference itself gives when they are turned by up to 3e-6 rad:
+    # they pass an edge, or graze a wall, more closely than float32 can say
     n_ambiguous: int
-    n_wrong: int
+    n_wrong: int  # Rays off by more than the tolerance for no such reason
 
 
 def agreement(segments: np.ndarray, poses: Poses, ranges: np.ndarray, tolerance: float = 1e-3) -> Agreement:

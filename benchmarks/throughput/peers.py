@@ -24,20 +24,13 @@ _ABOUT = "JaxNav: one agent, 16 beams of 6 m sampled every 5 cm, maps of 11 by 1
 
 @dataclass
 class Peer:
-    """Measurements of a peer.
+    """Measurements of a peer."""
 
-    Attributes:
-        name: Short name.
-        about: Description with its settings.
-        version: Version of its package.
-        speeds: One for each batch size.
-        left_out: Reason for each batch size, or `all`, that was not measured.
-    """
-
-    name: str
-    about: str = _ABOUT
-    version: str | None = None
-    speeds: list[Speed] = field(default_factory=list)
+    name: str  # Short name
+    about: str = _ABOUT  # Description with its settings
+    version: str | None = None  # Version of its package
+    speeds: list[Speed] = field(default_factory=list)  # One for each batch size
+    # Reason for each batch size, or `all`, that was not measured
     left_out: dict[str, str] = field(default_factory=dict)
 
 

@@ -21,31 +21,18 @@ SCHEMA = "subterra.throughput/2"
 
 @dataclass
 class Result:
-    """All measurements of one run.
+    """All measurements of one run."""
 
-    Attributes:
-        config: Settings of the run.
-        environment: Date, hardware and versions.
-        tunnel: Name, length (m), lining and wall segments.
-        n_beams: Beams of our LiDAR.
-        exactness: Comparison of our LiDAR with the reference; `None` if skipped.
-        speeds: Our speeds, one for each batch size.
-        floor: Speeds of the same loop with nothing simulated.
-        peers: Other environments.
-        lengths: Speeds in tunnels of several lengths.
-        linings: Speeds in several linings of the tunnel.
-    """
-
-    config: ThroughputConfig
-    environment: dict[str, Any]
-    tunnel: dict[str, Any]
-    n_beams: int
-    exactness: Agreement | None = None
-    speeds: list[Speed] = field(default_factory=list)
-    floor: list[Speed] = field(default_factory=list)
-    peers: list[Peer] = field(default_factory=list)
-    lengths: list[Variant] = field(default_factory=list)
-    linings: list[Variant] = field(default_factory=list)
+    config: ThroughputConfig  # Settings of the run
+    environment: dict[str, Any]  # Date, hardware and versions
+    tunnel: dict[str, Any]  # Name, length (m), lining and wall segments
+    n_beams: int  # Beams of our LiDAR
+    exactness: Agreement | None = None  # Comparison of our LiDAR with the reference; `None` if skipped
+    speeds: list[Speed] = field(default_factory=list)  # Our speeds, one for each batch size
+    floor: list[Speed] = field(default_factory=list)  # Speeds of the same loop with nothing simulated
+    peers: list[Peer] = field(default_factory=list)  # Other environments
+    lengths: list[Variant] = field(default_factory=list)  # Speeds in tunnels of several lengths
+    linings: list[Variant] = field(default_factory=list)  # Speeds in several linings of the tunnel
 
     @property
     def gates(self) -> list[Agreement]:

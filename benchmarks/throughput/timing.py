@@ -19,56 +19,35 @@ Carry = tuple[Any, Any]
 
 @dataclass(frozen=True)
 class Loop:
-    """A batch of environments under random actions.
+    """A batch of environments under random actions."""
 
-    Attributes:
-        reset: Maps key and params to observations and state.
-        step: Maps key, observations and state, and params to new observations and state, a scalar that depends on all
-            other outputs of the step, and the share of environments whose episode ended.
-        params: Constant inputs of the step; an argument of the compiled program, not a constant in it.
-    """
-
-    reset: Callable[[PRNGKeyArray, Any], Carry]
+    reset: Callable[[PRNGKeyArray, Any], Carry]  # Maps key and params to observations and state
+    # Maps key, observations and state, and params to new observations and state, a scalar that depends on all other
+    # outputs of the step, and the share of environments whose episode ended
     step: Callable[[PRNGKeyArray, Carry, Any], tuple[Carry, Float[Array, ""], Float[Array, ""]]]
-    params: Any = None
+    params: Any = None  # Constant inputs of the step; an argument of the compiled program, not a constant in it
 
 
 @dataclass(frozen=True)
 class Timing:
-    """Number and length of timed calls.
+    """Number and length of timed calls."""
 
-    Attributes:
-        steps: Steps in one call.
-        repeats: Timed calls.
-        seconds: Time limit for all calls, s; a call gets fewer steps to keep to it.
-        seed: Seed for resets and steps.
-    """
-
-    steps: int = 100
-    repeats: int = 20
-    seconds: float = 30.0
-    seed: int = 0
+    steps: int = 100  # Steps in one call
+    repeats: int = 20  # Timed calls
+    seconds: float = 30.0  # Time limit for all calls, s; a call gets fewer steps to keep to it
+    seed: int = 0  # Seed for resets and steps
 
 
 @dataclass(frozen=True)
 class Speed:
-    """Measurements at one batch size.
+    """Measurements at one batch size."""
 
-    Attributes:
-        n_envs: Environments in the batch.
-        steps: Steps in one call.
-        compile_seconds: Time to trace and compile the call, s; not part of any other figure.
-        steps_per_second: Environment steps per second of each timed call.
-        share_done: Share of steps at which an episode ended.
-        checksum: Sum of all outputs of all timed steps; the same for the same seed, device and versions.
-    """
-
-    n_envs: int
-    steps: int
-    compile_seconds: float
-    steps_per_second: list[float]
-    share_done: float
-    checksum: float
+    n_envs: int  # Environments in the batch
+    steps: int  # Steps in one call
+    compile_seconds: float  # Time to trace and compile the call, s; not part of any other figure
+    steps_per_second: list[float]  # Environment steps per second of each timed call
+    share_done: float  # Share of steps at which an episode ended
+    checksum: float  # Sum of all outputs of all timed steps; the same for the same seed, device and versions
 
     @property
     def quartiles(self) -> tuple[float, float, float]:
@@ -79,26 +58,18 @@ class Speed:
 
 @dataclass
 class Program:
-    """A compiled call and the results of its timed calls so far.
+    """A compiled call and the results of its timed calls so far."""
 
-    Attributes:
-        n_envs: Environments in the batch.
-        steps: Steps in one call.
-        compile_seconds: Time to trace and compile it, s.
-        restart: Start every call from the same state instead of where the last call ended.
-        totals: Sum of the step outputs of each timed call.
-    """
-
-    n_envs: int
-    steps: int
-    compile_seconds: float
-    restart: bool
+    n_envs: int  # Environments in the batch
+    steps: int  # Steps in one call
+    compile_seconds: float  # Time to trace and compile it, s
+    restart: bool  # Start every call from the same state instead of where the last call ended
     _call: Callable[..., Any]
     _params: Any
     _carry: Carry
     _rates: list[float] = field(default_factory=list)
     _done: list[float] = field(default_factory=list)
-    totals: list[float] = field(default_factory=list)
+    totals: list[float] = field(default_factory=list)  # Sum of the step outputs of each timed call
 
     def call(self, key: PRNGKeyArray, keep: bool = True) -> float:
         """Runs one call and returns its time, s.

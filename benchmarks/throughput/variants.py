@@ -19,21 +19,14 @@ _LONG = "open:straight:train:0"
 
 @dataclass(frozen=True)
 class Variant:
-    """One of several tunnels, timed in turn with the others.
+    """One of several tunnels, timed in turn with the others."""
 
-    Attributes:
-        name: Length (m) or lining.
-        n_segments: Number of wall segments of the tunnel.
-        speed: Speed of its environment.
-        cost: Step time relative to the first variant in the same round: lower quartile, median, upper quartile.
-        exactness: Comparison of the LiDAR with the reference; `None` if skipped.
-    """
-
-    name: str
-    n_segments: int
-    speed: Speed
+    name: str  # Length (m) or lining
+    n_segments: int  # Number of wall segments of the tunnel
+    speed: Speed  # Speed of its environment
+    # Step time relative to the first variant in the same round: lower quartile, median, upper quartile
     cost: tuple[float, float, float]
-    exactness: Agreement | None
+    exactness: Agreement | None  # Comparison of the LiDAR with the reference; `None` if skipped
 
 
 def measure_lengths(config: ThroughputConfig, timing: Timing) -> list[Variant]:

@@ -13,35 +13,25 @@ POCKET = np.dtype([(name, float) for name in ("station", "angle", "length", "wid
 
 @dataclass(frozen=True)
 class Tube:
-    """A D-shaped bore, by default a left-hand bend; m, rad.
-
-    Attributes:
-        bend: Radius of the bend in plan; `inf` is straight.
-        heading: Of the first tangent; not a multiple of a right angle, so that nothing is aligned with the world.
-        variation: Relative change of width and height along the tube, a sine of 9 m.
-        shift: The axis's offset to the left and upwards.
-        rings: Station of the first joint; pockets lie 0.22 m before and after each.
-        depth: Of the pockets, 0 for none.
-        first_sleeper: Station.
-        rise: Top of the sleepers above the floor.
-    """
+    """A D-shaped bore, by default a left-hand bend; m, rad."""
 
     length: float = 18.0
     width: float = 5.6
     height: float = 6.2
-    bend: float = 300.0
+    bend: float = 300.0  # Radius of the bend in plan; `inf` is straight
+    # Of the first tangent; not a multiple of a right angle, so that nothing is aligned with the world
     heading: float = 0.3
     grade: float = 0.01
-    variation: float = 0.006
-    shift: tuple[float, float] = (0.0, 0.0)
-    rings: float = 0.7
+    variation: float = 0.006  # Relative change of width and height along the tube, a sine of 9 m
+    shift: tuple[float, float] = (0.0, 0.0)  # The axis's offset to the left and upwards
+    rings: float = 0.7  # Station of the first joint; pockets lie 0.22 m before and after each
     pitch: float = 1.5
-    depth: float = 0.13
+    depth: float = 0.13  # Of the pockets, 0 for none
     track: bool = True
-    first_sleeper: float = 0.3
+    first_sleeper: float = 0.3  # Station
     spacing: float = 0.6
     gauge: float = 1.435
-    rise: float = 0.06
+    rise: float = 0.06  # Top of the sleepers above the floor
     origin: tuple[float, float, float] = (200.0, -100.0, 30.0)
 
     def frames(self, station) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
