@@ -1,6 +1,7 @@
-"""PPO of rejax, unchanged; `pip install 'gymnax<1' rejax`.
+"""PPO of rejax, unchanged.
 
-Gymnax asks for other releases of Gymnasium than the rest of the house: an environment of its own, or `--no-deps`.
+Gymnax asks for another Gymnasium than the rest of the house. So both go to a folder of their own, put on `PYTHONPATH`:
+`pip install --no-deps --target rejax-site rejax 'gymnax<1' distrax tfp-nightly chex dm-tree toolz wrapt gast decorator`.
 """
 
 from typing import Any
