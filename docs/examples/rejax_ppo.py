@@ -1,7 +1,7 @@
 """PPO of rejax, unchanged.
 
 Gymnax asks for another Gymnasium than the rest of the house. So both go to a folder of their own, put on `PYTHONPATH`:
-`pip install --no-deps --target rejax-site rejax 'gymnax<1' distrax tfp-nightly chex dm-tree toolz wrapt gast decorator`.
+`pip install --no-deps -t rejax-site rejax 'gymnax<1' distrax tfp-nightly chex dm-tree toolz wrapt gast decorator`.
 """
 
 from typing import Any
