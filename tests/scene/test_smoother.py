@@ -10,7 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from scene.errors import FitError
-from scene.poses.smoother import Noise, inertial_problem, odometry_problem, solve_with_heading
+from scene.poses.imu import integrals
+from scene.poses.smoother import Noise, inertial_problem, means_between, odometry_problem, solve_with_heading
 from scene.poses.terms import KNOT_SIZE, Chain, Motion, NormalEquations, Sightings, Steps, add_motion
 from tests.scene import walks
 
@@ -59,6 +60,12 @@ def test_odometry_outside_the_time_of_the_control_is_an_error():
     with pytest.raises(FitError, match=r"prism\.tum: only 0 sweeps"):
         odometry_problem(odometry, type(control)(control.times + 1e4, control.positions, control.path, 0),
                          walks.LEVER, Noise())  # fmt: skip
+
+
+def test_samples_are_integrated_by_the_trapezium_rule():
+    times, values = np.array([0.0, 1.0, 3.0]), np.array([[0.0, 1.0, 2.0], [1.0, 1.0, 0.0], [3.0, 1.0, 0.0]])
+    np.testing.assert_allclose(integrals(times, times, values), [[0, 0, 0], [0.5, 1, 1], [4.5, 3, 1]])
+    np.testing.assert_allclose(means_between(times, times, values), [[0.5, 1, 1], [2, 1, 0]])
 
 
 class Recorder:

@@ -10,6 +10,7 @@ from plyfile import PlyData
 from pypcd4 import PointCloud
 from rosbags.rosbag1 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from scipy.spatial.transform import Rotation
 
 from tests.scene.surveyed import Cast, Trajectory, frames, load_cast, load_trajectory, read_tum, survey
 
@@ -213,11 +214,17 @@ def test_nails_cross_the_pockets_that_they_join(truth: dict, cast: Cast) -> None
     assert np.median(reach) == pytest.approx(0.3 + 0.06 - 0.014, abs=4e-3)
 
 
-def test_the_prism_is_seen_unevenly_and_without_an_attitude(folder: Path) -> None:
+def test_the_prism_is_a_lever_arm_away_from_the_lidar(folder: Path, trajectory: Trajectory) -> None:
     time, rows = read_tum(folder / "prism.tum")
     assert (np.diff(time) < 0).sum() >= 1
     assert not rows[:, 3:].any()
     assert np.median(np.diff(np.sort(time))) == pytest.approx(1 / 3, abs=0.05)
+    position, attitude = trajectory.at(time)
+    # GEODE's evaluation: T_leica = T_lidar · inv(T), T as printed there.
+    turn, shift = Rotation.from_quat([-0.00492765, 0.00575961, 0.0117651, 0.999901]), [0.00947221, -0.308202, -0.365733]
+    error = rows[:, :3] - (position - attitude.apply(turn.inv().apply(shift)))
+    assert error.std() == pytest.approx(0.0025, abs=6e-4)
+    assert abs(error.mean(axis=0)).max() < 1.5e-3
 
 
 def test_the_external_imu_turns_with_the_lidar(bag: Bag, trajectory: Trajectory) -> None:

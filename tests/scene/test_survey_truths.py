@@ -80,6 +80,8 @@ def test_sizes_are_those_of_the_class(bare: tuple[Path, dict, Cast]) -> None:
         assert np.median(width[middle]) - np.median(width[station < 4.0]) == pytest.approx(1.0, abs=0.2)
     if name == "irregular":
         assert width[-1] - np.median(width) > 2.0
+        smooth = np.array(truth["width_smooth"])[np.searchsorted(station, LENGTH - np.array([6.0, 3.0, 0.0]))]
+        np.testing.assert_allclose(smooth - smooth[0], [0.0, 0.75, 3.0], atol=0.15)  # opens with the square
         assert not truth["pockets"] + truth["rings"]["station"]
 
 
