@@ -308,18 +308,3 @@ def test_spaces_have_samples_and_know_what_they_contain():
     assert not action.contains(jnp.full(4, jnp.nan))
     assert not action.contains(jnp.zeros(3))
     assert not action.contains(action.high + 1.0)
-
-
-@pytest.mark.parametrize(("shape", "batched"), [((1,), False), ((3,), False), ((7,), False), ((8, 1), True)])
-def test_an_action_of_another_shape_is_refused_in_one_sentence(shape, batched):
-    env, params = st.make("Subterra/TraverseShort-v1")
-    if batched:
-        batch = st.AutoReset(env)
-        _, state = batch.reset(jax.random.key(0), params, 8)
-        env = batch
-    else:
-        _, state = env.reset(jax.random.key(0), params)
-    with pytest.raises(
-        ValueError, match=r"an action of Subterra/TraverseShort-v1 has 2 numbers, got an array of shape"
-    ):
-        env.step(jax.random.key(1), state, jnp.zeros(shape), params)

@@ -55,12 +55,12 @@ def test_scans_among_boxes_agree_with_float64_on_walls_and_boxes_alike(tunnel):
     state = state.replace(obstacles=state.obstacles.replace(start=0.0))  # as if it had begun at the mouth
     own, sizes = state.obstacles, params.obstacles
     sizes = sizes.replace(first=sizes.first + own.start)
-    boxes = obstacles.boxes_in(own.seed, slots, params.tunnel, sizes)
+    boxes = jax.jit(obstacles.boxes_in)(own.seed, slots, params.tunnel, sizes)
     sides = np.asarray(segments(boxes), np.float64).reshape(-1, 4)
     everything = np.concatenate([walls, sides])
     free = reference.clearance(sides, poses.position) > 0.3
     inside = np.asarray(
-        jax.vmap(obstacles.clearance, (None, 0, 0, None, None))(
+        jax.jit(jax.vmap(obstacles.clearance, (None, 0, 0, None, None)))(
             own.seed, poses.station, poses.position, params.tunnel, sizes
         )
     )
@@ -81,7 +81,7 @@ def test_scans_among_boxes_agree_with_float64_on_walls_and_boxes_alike(tunnel):
 def test_there_is_always_a_way_past(tunnel):
     slots = jnp.arange(1, 23)
     seeds = jax.random.bits(jax.random.key(0), (200,))
-    boxes = jax.vmap(obstacles.boxes_in, (0, None, None, None))(seeds, slots, tunnel, PARAMS)
+    boxes = jax.jit(jax.vmap(obstacles.boxes_in, (0, None, None, None)))(seeds, slots, tunnel, PARAMS)
     corners = np.asarray(jax.vmap(segments)(boxes))[..., :2]
     plan = st.load_tunnel("subterra-351")
     free, trolleys = [], 0
@@ -104,7 +104,7 @@ def test_there_is_always_a_way_past(tunnel):
 
 def test_the_clearance_is_the_distance_to_the_nearest_side(tunnel):
     slots = jnp.arange(1, 20)
-    boxes = obstacles.boxes_in(jnp.uint32(5), slots, tunnel, PARAMS)
+    boxes = jax.jit(obstacles.boxes_in)(jnp.uint32(5), slots, tunnel, PARAMS)
     sides = np.asarray(segments(boxes), np.float64).reshape(-1, 4)
     plan, compared = st.load_tunnel("subterra-351"), 0
     clearance = jax.jit(obstacles.clearance)
@@ -120,7 +120,8 @@ def test_the_clearance_is_the_distance_to_the_nearest_side(tunnel):
 
 def test_two_episodes_have_different_boxes_and_one_always_the_same(tunnel):
     slots = jnp.arange(1, 20)
-    a, again, b = (obstacles.boxes_in(jnp.uint32(seed), slots, tunnel, PARAMS).centre for seed in (1, 1, 2))
+    placed = jax.jit(obstacles.boxes_in)
+    a, again, b = (placed(jnp.uint32(seed), slots, tunnel, PARAMS).centre for seed in (1, 1, 2))
     np.testing.assert_array_equal(a, again)
     assert (np.asarray(a) != np.asarray(b)).any(axis=1).mean() > 0.8
 

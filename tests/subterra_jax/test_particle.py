@@ -130,10 +130,10 @@ def test_a_cloud_speaks_for_its_heaviest_cluster_and_admits_the_other():
 
 @pytest.fixture(scope="module")
 def pockets():
-    """The short stop between pockets, cut to 400 steps, and the filter's records of a few episodes."""
-    env, params = st.make("Subterra/StopAtShort-v1", tunnel="subterra-351", horizon=400)
+    """The short stop between pockets, cut to 300 steps, and the filter's records of a few episodes."""
+    env, params = st.make("Subterra/StopAtShort-v1", tunnel="subterra-351", horizon=300)
     episodes = listed_episodes(env, params, 10)
-    return env, params, episodes, evaluate(env, params, particle_filter(params, 128), episodes)
+    return env, params, episodes, evaluate(env, params, particle_filter(params, 64), episodes)
 
 
 def test_the_filter_stops_at_the_goal_where_dead_reckoning_does_not(pockets):

@@ -3,6 +3,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 from jaxtyping import install_import_hook
 
 from tests.subterra_jax import checking
@@ -49,10 +50,13 @@ def train_small(tunnel, tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
-def trained(train_small) -> Path:
-    """A run folder in which the corridor has been learnt."""
-    status, out = train_small("--steps=250000", "--stop-patience=5")
-    assert status == 0
+def trained(train_small, tmp_path_factory, worker_id) -> Path:
+    """A run folder in which the corridor has been learnt, by one of the workers for all."""
+    base = tmp_path_factory.getbasetemp()
+    out = (base if worker_id == "master" else base.parent) / "trained"
+    with FileLock(f"{out}.lock"):
+        if not (out / "evaluation.json").exists():
+            assert train_small("--steps=250000", "--stop-patience=5", out=out)[0] == 0
     return out
 
 

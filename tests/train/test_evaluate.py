@@ -111,7 +111,8 @@ def test_an_ablation_takes_away_what_it_names_and_nothing_else():
     agent = make_agent(driver, Policy(driver.init(jax.random.PRNGKey(0))))
 
     def reads(agent):
-        return np.asarray(agent.act(None, agent.begin(None, begun, params), obs, params, None)[1].kept.seen)
+        act = jax.jit(lambda obs: agent.act(None, agent.begin(None, begun, params), obs, params, None))
+        return np.asarray(act(obs)[1].kept.seen)
 
     whole = reads(agent)
     beams = slice(4, 4 + 2 * params.lidar.n_beams)
@@ -133,7 +134,7 @@ def test_without_its_localiser_a_policy_reads_the_dead_reckoned_way():
     drifted = dataclasses.replace(obs, distance=obs.distance + 5.0)
 
     def way(agent):
-        _, memory = agent.act(None, agent.begin(None, obs, params), drifted, params, None)
-        return 100.0 * float(memory.kept.seen[3])
+        act = jax.jit(lambda drifted: agent.act(None, agent.begin(None, obs, params), drifted, params, None))
+        return 100.0 * float(act(drifted)[1].kept.seen[3])
 
     assert way(agent) - way(without(agent, "memory")) == pytest.approx(5.0, abs=0.2)

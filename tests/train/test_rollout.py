@@ -103,8 +103,14 @@ def test_a_robot_is_told_the_length_of_its_own_tunnel_of_a_stack(tmp_path):
     env, params = st.make("Subterra/Traverse-v1", tunnel=plans, horizon=HORIZON)
     driver = Driver(env, make_layout(env, params, CONFIG))
     policy = Policy(driver.init(jax.random.PRNGKey(0)))
-    drive = begin(env, driver, policy, params, jax.random.PRNGKey(1), 8)
+
+    @jax.jit
+    def two_steps(params):
+        drive = begin(env, driver, policy, params, jax.random.PRNGKey(1), 8)
+        collect(env, driver, policy, params, drive, jax.random.PRNGKey(2), 2)
+        return drive
+
+    drive = two_steps(params)
     assert set(np.asarray(drive.env_state.tunnel)) == {0, 1}
     way = jax.vmap(driver.layout.reckoned_way)(drive.kept.seen)
     np.testing.assert_allclose(way, lengths[drive.env_state.tunnel], atol=1e-3)
-    collect(env, driver, policy, params, drive, jax.random.PRNGKey(2), 2)
