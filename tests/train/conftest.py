@@ -1,4 +1,5 @@
 import json
+import os
 import sys
 from pathlib import Path
 
@@ -50,10 +51,10 @@ def train_small(tunnel, tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
-def trained(train_small, tmp_path_factory, worker_id) -> Path:
+def trained(train_small, tmp_path_factory) -> Path:
     """A run folder in which the corridor has been learnt, by one of the workers for all."""
     base = tmp_path_factory.getbasetemp()
-    out = (base if worker_id == "master" else base.parent) / "trained"
+    out = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "trained"
     with FileLock(f"{out}.lock"):
         if not (out / "evaluation.json").exists():
             assert train_small("--steps=250000", "--stop-patience=5", out=out)[0] == 0
