@@ -54,7 +54,8 @@ def train_small(tunnel, tmp_path_factory):
 def trained(train_small, tmp_path_factory) -> Path:
     """A run folder in which the corridor has been learnt, by one of the workers for all."""
     base = tmp_path_factory.getbasetemp()
-    out = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "trained"
+    out = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "shared" / "trained"
+    out.parent.mkdir(exist_ok=True)
     with FileLock(f"{out}.lock"):
         if not (out / "evaluation.json").exists():
             assert train_small("--steps=250000", "--stop-patience=5", out=out)[0] == 0
