@@ -135,9 +135,8 @@ class TrainConfig:
 
     # What may differ when a run goes on; nothing else may.
     LIMITS: ClassVar[tuple[str, ...]] = ("steps", "stop_coverage", "stop_patience", "checkpoint_every")
-    # Whether a policy that once did best is kept although later ones do worse. The first hundred episodes to end are
-    # the short ones, and easier than those after them: they would choose a policy that has hardly learnt.
-    KEEPS_BEST: ClassVar[bool] = False
+    # Whether a policy that once did best is kept although later ones do worse.
+    KEEPS_BEST: ClassVar[bool] = True
 
     @property
     def steps_per_iteration(self) -> int:
@@ -174,8 +173,7 @@ _BY_MEMORY: dict[str, dict[str, Any]] = {
     "stack": {"steps": 200_000_000},
     "gru": {"steps": 300_000_000, "n_envs": 32_768, "unroll": 32, "minibatches": 8},
     "along": {
-        "steps": 10_000_000,
-        "last_rate": 0.05,
+        "steps": 16_000_000,
         "n_envs": 2048,
         "minibatches": 4,
         "drives": 512,
