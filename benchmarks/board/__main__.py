@@ -12,7 +12,7 @@ import sys
 
 from benchmarks.board import picture, tables
 from benchmarks.board.cells import read_cells
-from benchmarks.board.drive import BoardConfig, check, conditions_of_parts, drive, is_there, jobs_of
+from benchmarks.board.drive import BoardConfig, check, choose_by_rule, conditions_of_parts, drive, is_there, jobs_of
 from benchmarks.board.records import records_of
 from benchmarks.command import run_main
 from benchmarks.records import write_records
@@ -47,6 +47,7 @@ def run(config: BoardConfig) -> None:
 
 def main(words: list[str] | None = None) -> int:
     """Runs the command line; returns 2 for a user's mistake, 130 for an interrupt, after which a run can go on."""
+    choose_by_rule()
     again = "interrupted; the same command goes on"
     return run_main("board", BoardConfig, run, description=__doc__, words=words, interrupted=again)
 

@@ -15,7 +15,7 @@ from rich.console import Console
 
 from benchmarks.board.cells import Cell, read_cells, setting_of
 from benchmarks.board.columns import Column, draw_episodes, tunnel_names
-from benchmarks.board.drive import BoardConfig, Job, conditions_of_parts, enter
+from benchmarks.board.drive import BoardConfig, Job, choose_by_rule, conditions_of_parts, enter
 from benchmarks.board.roster import make_agent
 from benchmarks.command import BenchmarkError, require_least, run_main
 from benchmarks.records import measured, write_records
@@ -103,6 +103,7 @@ def compare(cell: Cell, config: AgainConfig) -> dict[str, Any]:
 
 def main(words: list[str] | None = None) -> int:
     """Runs the command line; returns 0 where all cells are the same, 1 where one is not, 2 for a user's mistake."""
+    choose_by_rule()
     return run_main("board.again", AgainConfig, run, description=__doc__, words=words)
 
 

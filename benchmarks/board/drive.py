@@ -4,6 +4,7 @@ import dataclasses
 import hashlib
 import itertools
 import json
+import os
 import re
 import time
 from pathlib import Path
@@ -67,6 +68,13 @@ class Job:
     setting: Setting
     agent: str
     sensor: str
+
+
+def choose_by_rule() -> None:
+    """Let XLA choose kernels by rule, not by timing, if it has not started: the same cell then has the same bytes."""
+    flags = os.environ.get("XLA_FLAGS", "")
+    if "autotune_level" not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} --xla_gpu_autotune_level=0".strip()
 
 
 def check(config: BoardConfig) -> None:

@@ -40,6 +40,13 @@ def cell(agent, success, task="StopAt", n=40, floor=0.3, splits=("val",), hidden
     }
 
 
+def test_kernels_are_chosen_by_rule_beside_what_a_user_asks_of_the_compiler(monkeypatch):
+    for given, asked in (("--a=1", "--a=1 --xla_gpu_autotune_level=0"), (f := "--xla_gpu_autotune_level=4", f)):
+        monkeypatch.setenv("XLA_FLAGS", given)
+        drive.choose_by_rule()
+        assert drive.os.environ["XLA_FLAGS"] == asked
+
+
 def test_a_column_has_its_own_tunnels_and_a_split_its_own_seeds():
     some = columns.columns_of(SPLITS, ("control",))
     assert len(some) == 11
