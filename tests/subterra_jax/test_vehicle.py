@@ -12,11 +12,12 @@ from subterra_jax.tunnel.sources import load_tunnel
 from tests.subterra_jax import tunnels
 
 PARAMS = jax.tree.map(jnp.asarray, vehicle.VehicleParams())
+clearance, foot_of_each = jax.jit(vehicle.clearance), jax.jit(jax.vmap(foot, (None, 0, 0)))
 
 
 def touching(tunnel, position, station):
     """Whether a robot at a place is in contact."""
-    clear = vehicle.clearance(tunnel, jnp.array(position), jnp.float32(station))
+    clear = clearance(tunnel, jnp.array(position, jnp.float32), jnp.float32(station))
     return bool(vehicle.in_contact(tunnel, clear, jnp.float32(station), PARAMS))
 
 
@@ -93,7 +94,7 @@ def test_the_foot_on_the_centreline_is_found_from_the_previous_station(plan_of, 
     truth, rng = tunnels.Plan(pieces), np.random.default_rng(0)
     station, lateral = rng.uniform(0.0, 150.0, 1000), rng.uniform(-2.4, 2.4, 1000)
     near = station + rng.uniform(-0.2, 0.2, 1000)
-    found = jax.vmap(foot, (None, 0, 0))(tunnel, np.float32(truth.point(station, lateral)), np.float32(near))
+    found = foot_of_each(tunnel, np.float32(truth.point(station, lateral)), np.float32(near))
     np.testing.assert_allclose(found.station, station, atol=1.5e-3)
     np.testing.assert_allclose(found.lateral, lateral, atol=1.5e-3)
     np.testing.assert_allclose(found.half_width, 2.825, atol=1e-5)
