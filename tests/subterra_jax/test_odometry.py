@@ -15,6 +15,13 @@ N, T = 4000, 50
 
 def drift(params: odometry.OdometryParams, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Dead-reckoned distance and heading, `(N, T)`, of N episodes at 1 m/s and 0.01 rad/s."""
+    distance, heading = _drift(jax.tree.map(jnp.float32, params), seed)
+    return np.asarray(distance).T, np.asarray(heading).T
+
+
+@jax.jit
+def _drift(params: odometry.OdometryParams, seed: int) -> tuple[jax.Array, jax.Array]:
+    """Series `(T, N)`."""
     bias_key, noise_key = jax.random.split(jax.random.key(seed))
     state = jax.vmap(odometry.start_odometry, (0, None))(jax.random.normal(bias_key, (N, 2)), params)
 
@@ -23,8 +30,7 @@ def drift(params: odometry.OdometryParams, seed: int = 0) -> tuple[np.ndarray, n
         state = advance(state, jnp.array([1.0, 0.01]), jnp.float32(0.1), noise, params)
         return state, (state.distance, state.heading)
 
-    _, (distance, heading) = jax.lax.scan(step, state, jax.random.normal(noise_key, (T, N, 2)))
-    return np.asarray(distance).T, np.asarray(heading).T
+    return jax.lax.scan(step, state, jax.random.normal(noise_key, (T, N, 2)))[1]
 
 
 def test_without_errors_dead_reckoning_is_the_truth():
