@@ -81,6 +81,8 @@ class AutoReset:
         n_envs = action.shape[0]
         noise = self.env.draw_step(step_key, (n_envs,), params)
         stepped, reward, terminated, truncated, info = self._vmap(self.env.advance, 3)(state, action, noise, params)
+        # A consumer's sum over the flags would draw the whole step into its kernel, which sums with few threads.
+        terminated, truncated = jax.lax.optimization_barrier((terminated, truncated))
         begun = self._vmap(self.env.begin, 1)(self.env.draw_reset(start_key, (n_envs,), params), params)
         done = terminated | truncated
         merged = jax.tree.map(

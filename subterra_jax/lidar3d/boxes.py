@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from subterra_jax.lidar3d.surface import BOX_CORNERS, BOX_FACES, Triangles
 
-_SQUARE = 1e-6  # m, and share, by which a box may be askew
+_SQUARE = 2e-5  # m, and share, by which a box may be askew: a tunnel's file has whole units
 
 
 @dataclasses.dataclass(frozen=True)
