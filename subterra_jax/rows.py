@@ -103,6 +103,6 @@ def axes(batched: Any) -> tuple[Any, ...]:
 def spread(row: tuple[Any, ...], batched: Any, axis_size: int) -> list[jax.Array]:
     """Arrays of which some have a batch axis, all with one of `axis_size`."""
     return [
-        part if is_batched else jnp.broadcast_to(part, (axis_size, *jnp.shape(part)))
+        jnp.asarray(part) if is_batched else jnp.broadcast_to(part, (axis_size, *jnp.shape(part)))
         for part, is_batched in zip(row, batched, strict=True)
     ]

@@ -68,7 +68,7 @@ def _search(
         block = first + (key & jnp.int32((1 << n_bits) - 1))
         # A beam that enters fewer boxes gets arbitrary blocks for the rest: a hit on any wall is a hit.
         block = jnp.minimum(block, tunnel.box.shape[1] - 1)
-        each = hits(tunnel, block, position, direction)
+        each = _hits(tunnel, block, position, direction)
         last, distance = key[:, -1], jnp.minimum(found.distance, jnp.min(each, axis=-1))
         met = jnp.take_along_axis(block, jnp.argmin(each, axis=-1)[:, None], axis=-1)[:, 0]
         entry = lax.bitcast_convert_type(last & jnp.int32(-(1 << n_bits)), jnp.float32)
@@ -92,17 +92,10 @@ def _following(
     direction: Float[Array, "n_beams 2"],
     last: Int[Array, "n_beams"],
 ) -> Int[Array, "n_beams n_candidates"]:
-    """Return the keys of the boxes that each beam enters next after one, nearest first; `NOTHING` after the last.
+    """Return the keys of the boxes that each beam enters next after the `last`, nearest first; then `NOTHING`.
 
     With m the middle of a box and e its half axis, both from the LiDAR, a line along d crosses the box if
     |d × m| ≤ |d × e| + thickness, and does so at the distance (m × e) / (d × e), whose numerator all beams share.
-
-    Args:
-        tunnel: The tunnel.
-        first: First block of the window.
-        position: Position of the LiDAR, tunnel frame, m.
-        direction: Unit vectors of the beams; if their number is even, the second half must oppose the first.
-        last: Key of the box that was entered last; -1 for none.
     """
     n_beams, n_bits = direction.shape[0], (tunnel.n_scan - 1).bit_length()
     # Opposite beams share a line, and so everything but its sense.
@@ -129,15 +122,8 @@ def _entries(
 ) -> tuple[Int[Array, "k m"], Int[Array, "k m"]]:
     """For each box and line, the distance of the crossing and the box's number in one sortable integer.
 
-    Args:
-        box: Boxes, as in `Tunnel`.
-        number: Their numbers.
-        n_bits: Bits that a number takes.
-        position: Origin of the lines, m.
-        lines: Their unit vectors.
-
     Returns:
-        Crossings ahead, and crossings behind; `NOTHING` where there is none. Distances lose their last bits to the
+        Crossings ahead, and crossings behind; `NOTHING` where there is none. Distances lose their last `n_bits` to the
         number, which makes them less by up to a few millimetres, never more.
     """
     box, number = box[:, :, None], number[:, None]
@@ -160,23 +146,13 @@ def _entries(
     return jnp.where(facing > least, key, NOTHING), jnp.where(-facing > least, key, NOTHING)
 
 
-def hits(
+def _hits(
     tunnel: Tunnel,
     block: Int[Array, "n_beams n_blocks"],
     position: Float[Array, "2"],
     direction: Float[Array, "n_beams 2"],
 ) -> Float[Array, "n_beams n_blocks"]:
-    """Distance at which each beam meets the walls of a few blocks.
-
-    Args:
-        tunnel: The tunnel.
-        block: The blocks to look at.
-        position: Position of the LiDAR, tunnel frame, m.
-        direction: Unit vectors of the beams.
-
-    Returns:
-        Distance to the nearest segment of each block, m; `inf` where the beam meets none.
-    """
+    """Distance at which each beam meets the nearest wall of each of a few blocks, m; `inf` where it meets none."""
     distance = _distances(tunnel, block, position, direction)
     # As integers, because a minimum of floats must look out for NaN, which costs a quarter of this function on a CPU.
     as_bits = jnp.dtype(f"int{8 * distance.dtype.itemsize}")

@@ -195,7 +195,7 @@ def _scan_kernel(
         return _Beam(number, cos * along - sin * across, sin * along + cos * across)
 
     def advance(beam: _Beam, visit: _Visit) -> _Visit:
-        m_x, m_y, e_x, e_y, thickness, _, n_x, n_y, ahead, behind = _block(block_ref, visit.block)
+        m_x, m_y, e_x, e_y, thickness, _, n_x, n_y, ahead, behind, _ = _block(block_ref, visit.block)
         m_x, m_y, n_x, n_y = m_x - x, m_y - y, n_x * visit.way, n_y * visit.way
         gap = n_x * m_x + n_y * m_y + jnp.where(visit.way > 0.0, ahead, behind)
         ends = gap > jnp.maximum(visit.best * (n_x * beam.d_x + n_y * beam.d_y), 0.0)
@@ -207,7 +207,7 @@ def _scan_kernel(
     def meet(beam: _Beam, visit: _Visit) -> _Visit:
         words = _block(block_ref, visit.block)
         middle, pairs = (words[0] - x, words[1] - y), jnp.where(visit.state == _ENTERED, words[5], 1)
-        return visit.left(_nearest(wall_ref, _first_pair(block_ref, visit.block), pairs, middle, beam))
+        return visit.left(_nearest(wall_ref, words[10], pairs, middle, beam))
 
     def one_round(carry: tuple[_Beam, _Visit]) -> tuple[_Beam, _Visit]:
         beam, visit = carry
@@ -238,15 +238,9 @@ def _count(state, what: int):
 
 
 def _block(block_ref, number):
-    """Return the numbers of each thread's block; see `packed.unpack`."""
+    """Return the numbers of each thread's block, see `packed.unpack`, and its first vertex pair."""
     one, two = load_words(block_ref, BLOCK_WORDS * number), load_words(block_ref, BLOCK_WORDS * number + 4)
-    return unpack((*one, *two[:2]))
-
-
-def _first_pair(block_ref, number):
-    from jax.experimental.pallas import triton
-
-    return triton.load(block_ref.at[BLOCK_WORDS * number + 6])
+    return *unpack((*one, *two[:2])), two[2]
 
 
 def _nearest(wall_ref, first_pair, pairs, middle, beam: _Beam):
@@ -290,7 +284,7 @@ def _gap_kernel(start_ref, x_ref, y_ref, block_ref, wall_ref, gap_ref, *, n_rows
     start, x, y = (triton.load(ref.at[row]) for ref in (start_ref, x_ref, y_ref))
 
     def advance(visit: _Visit) -> _Visit:
-        m_x, m_y, e_x, e_y, thickness, _, n_x, n_y, ahead, behind = _block(block_ref, visit.block)
+        m_x, m_y, e_x, e_y, thickness, _, n_x, n_y, ahead, behind, _ = _block(block_ref, visit.block)
         m_x, m_y = m_x - x, m_y - y
         gap = (n_x * m_x + n_y * m_y) * visit.way + jnp.where(visit.way > 0.0, ahead, behind)
         ends = (gap > 0.0) & (gap * gap > visit.best)
@@ -306,7 +300,7 @@ def _gap_kernel(start_ref, x_ref, y_ref, block_ref, wall_ref, gap_ref, *, n_rows
     def meet(visit: _Visit) -> _Visit:
         words = _block(block_ref, visit.block)
         middle, pairs = (words[0] - x, words[1] - y), jnp.where(visit.state == _ENTERED, words[5], 1)
-        return visit.left(_least_square(wall_ref, _first_pair(block_ref, visit.block), pairs, middle))
+        return visit.left(_least_square(wall_ref, words[10], pairs, middle))
 
     def one_round(visit: _Visit) -> _Visit:
         visit = lax.while_loop(lambda v: _count(v.state, _VISITS) > 0, advance, visit)

@@ -9,31 +9,21 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-_MOST = 4  # words that one instruction reads or writes
-
 
 def present() -> bool:
     """Tell whether this process computes on an NVIDIA GPU."""
     return jax.default_backend() == "gpu" and "nvidia" in jax.devices()[0].device_kind.lower()
 
 
-def load_words(ref, start, mask=None, n_words: int = _MOST):
-    """Return some words of each of many rows, read by one instruction; 0 where masked.
+def load_words(ref: Any, start: Array, n_words: int = 4) -> tuple[Array, ...]:
+    """Return 2 or 4 words of each of many rows of a flat array, read by one instruction.
 
-    Args:
-        ref: Flat array of words.
-        start: First word of each row, a multiple of their number.
-        mask: Rows to read; `None` for all.
-        n_words: Words of a row, 2 or 4.
+    The first word of a row is a multiple of their number.
     """
     from jax.experimental.pallas import triton
 
     column = jax.lax.broadcasted_iota(jnp.int32, (*start.shape, n_words), start.ndim)
-    # Triton takes no `other` without a mask.
-    masked: dict[str, Any] = (
-        {} if mask is None else {"mask": jnp.broadcast_to(mask[..., None], column.shape), "other": 0}
-    )
-    words = triton.load(ref.at[start[..., None] + column], **masked)
+    words = triton.load(ref.at[start[..., None] + column])
     zero = jnp.zeros_like(words)
     # Where JAX has 64 bits, it would sum words in as many.
     return tuple(jnp.sum(jnp.where(column == i, words, zero), axis=-1, dtype=words.dtype) for i in range(n_words))
@@ -47,6 +37,8 @@ def most(number: Array) -> Array:
 
 def fma(a: Array, b: Any, c: Any) -> Array:
     """Return a · b + c by one instruction: XLA keeps Triton from joining the two."""
+    if jax.default_backend() != "gpu":
+        return a * b + c
     return _instruction("fma.rn.f32 $0, $1, $2, $3;", "=f,f,f,f", a, b, c)
 
 

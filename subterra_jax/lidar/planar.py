@@ -9,11 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from subterra_jax import constants, native
-from subterra_jax.lidar import cast, gpu, nvidia
+from subterra_jax import constants
+from subterra_jax.lidar import cast, gpu, kernels, nvidia
 from subterra_jax.rows import rowwise, slope_along, vary_like
 from subterra_jax.tunnel import Tunnel, node_at
 
@@ -58,11 +57,10 @@ def scan(
         leaves through a mouth.
     """
     node = node_at(tunnel, station)
-    by_kernels = skips_unwanted(params) or (params.fused and native.supported())
     # Nothing that may differ within a batch but the rows themselves, or the kernels could not serve it.
     beams = dataclasses.replace(params, range_max=tunnel.reach, range_sigma=0.0)
     # The kernels know 32 bits.
-    by_kernels = by_kernels and position.dtype == jnp.float32 and tunnel.packed is not None
+    by_kernels = params.fused and kernels.present() and position.dtype == jnp.float32 and tunnel.packed is not None
     ranges = _true_ranges(by_kernels, (tunnel.walls, beams), position, heading, node, jnp.asarray(wanted))
     return jnp.minimum(ranges, params.range_max)
 
@@ -86,21 +84,8 @@ def _cast(
     return jnp.minimum(cast.nearest(tunnel, tunnel.scan_first[node], position, direction), params.range_max)
 
 
-def _cast_rows(what: tuple[Tunnel, LidarParams], *rows: Array) -> Float[Array, "n n_beams"]:
-    """Many scans in one tunnel."""
-    kernels = {}
-    if skips_unwanted(what[1]):
-        kernels["cuda"] = _by(gpu.scan)
-    if native.supported():
-        from subterra_jax.native import calls  # numba is optional
-
-        kernels["cpu"] = _by(calls.scan)
-    by_xla: Callable[..., Array] = jax.vmap(_cast, in_axes=(None, 0, 0, 0, 0))
-    return lax.platform_dependent(what, *rows, **kernels, default=by_xla)
-
-
 def _by(kernel: Callable[..., Array]) -> Callable[..., Array]:
-    """A kernel for many scans, with the arguments of `_cast_rows`."""
+    """A kernel for many scans in one tunnel, with the arguments of `_cast`."""
 
     def cast_rows(
         what: tuple[Tunnel, LidarParams], position: Array, heading: Array, node: Array, wanted: Array
@@ -114,6 +99,9 @@ def _by(kernel: Callable[..., Array]) -> Callable[..., Array]:
     return cast_rows
 
 
+_cast_rows = kernels.fastest(
+    jax.vmap(_cast, in_axes=(None, 0, 0, 0, 0)), _by(gpu.scan), _by(kernels.compiled_by_numba("scan"))
+)
 # One scan is cast by XLA; a batch of them in one tunnel by the kernels, however many `vmap`s made it.
 _cast_by_kernels = rowwise(_cast, lambda what, *rows: _cast_rows(what, *rows))
 
@@ -166,14 +154,9 @@ def beam_directions(heading: Float[Array, ""], n_beams: int) -> Float[Array, "n_
 def add_noise(
     ranges: Float[Array, "n_beams"], noise: Float[Array, "n_beams"], params: LidarParams
 ) -> Float[Array, "n_beams"]:
-    """Ranges as measured: true ranges plus noise, clipped to [0, range_max], m.
+    """Ranges as measured: true ranges plus noise, made of standard normal numbers, clipped to [0, range_max], m.
 
     A beam without a hit stays at exactly `range_max`: there is no echo for the noise to be in.
-
-    Args:
-        ranges: True ranges, m.
-        noise: Standard normal numbers.
-        params: The noise's size and the largest range.
     """
     noisy = jnp.clip(ranges + params.range_sigma * noise, 0.0, params.range_max)
     return jnp.where(ranges < params.range_max, noisy, params.range_max)

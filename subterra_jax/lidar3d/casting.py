@@ -15,8 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from subterra_jax.compiled import in_32_bits
 from subterra_jax.host.errors import SubterraError
-from subterra_jax.lidar3d.finding import find, find_facing, find_facing_from
-from subterra_jax.lidar3d.meeting import Hits, Point
+from subterra_jax.lidar3d.finding import find, find_from
 from subterra_jax.lidar3d.relief import Relief, block_contents
 
 
@@ -46,7 +45,7 @@ def scan(
     Raises:
         ValueError: There is no beam, or one is no number or no unit vector.
     """
-    _require_pattern(directions)
+    require_pattern(directions)
     beams = rotate(jnp.asarray(orientation, jnp.float32), jnp.asarray(directions, jnp.float32))
     return cast(relief, position, beams, station, range_max)
 
@@ -77,14 +76,14 @@ def cast(
     Raises:
         ValueError: There is no ray, or a direction known beforehand is no number or no unit vector.
     """
-    _require_pattern(directions)
+    require_pattern(directions)
     origin, station = jnp.asarray(origin, jnp.float32), jnp.asarray(station, jnp.float32)
     directions, limit = jnp.asarray(directions, jnp.float32), jnp.asarray(range_max, jnp.float32)
-    block, n = block_at(relief, origin, station), len(directions)
+    block = block_at(relief, origin, station)
     if directions.ndim == 3:
-        return _meet_from(relief.shared, origin, directions, block, limit)[0]
-    origins, blocks, limits = (jnp.broadcast_to(part, (n, *part.shape)) for part in (origin, block, limit))
-    return _ranges(relief.shared, origins, directions, blocks, limits)
+        return _meet(relief.shared, origin, directions, block, limit)[0]
+    origins, blocks, limits = (jnp.broadcast_to(x, (len(directions), *x.shape)) for x in (origin, block, limit))
+    return _meet(relief.shared, origins, directions, blocks, limits)[0]
 
 
 class Met(NamedTuple):
@@ -120,70 +119,57 @@ def meet(
     """
     if directions.ndim == 3:
         block = block_at(relief, origins, jnp.asarray(station, jnp.float32))
-        return Met(*_meet_from(relief.shared, origins, directions, block, limits))
+        return Met(*_meet(relief.shared, origins, directions, block, limits))
     blocks = jax.vmap(block_at, (None, 0, None))(relief, origins, jnp.asarray(station, jnp.float32))
     limits = jnp.broadcast_to(limits, len(directions))
     return Met(*_meet(relief.shared, origins, directions, blocks, limits))
 
 
-def _surfaces(
-    found: tuple[Hits, Point], origins: Array, directions: Array, limits: Array
-) -> tuple[Array, Array, Array]:
-    """Return ranges, normals and whether a thing is met, of what was found."""
-    hits, normal = found
-    return _clip(hits, origins, directions, limits), jnp.stack(normal, axis=-1), hits.entry < -1
-
-
 @jax.custom_jvp
 @in_32_bits()
 def _meet(
-    relief: Relief, origins: Array, directions: Array, blocks: Array, limits: Array
-) -> tuple[Array, Array, Array]:
-    return _surfaces(find_facing(relief, origins, directions, blocks, limits), origins, directions, limits)
+    relief: Relief,
+    origins: Float[Array, "*n 3"],
+    directions: Float[Array, "*image 3"],
+    blocks: Int[Array, "*n"],
+    limits: Float[Array, "*n"],
+) -> tuple[Float[Array, "*image"], Float[Array, "*image 3"], Bool[Array, "*image"]]:
+    """Return the rows of `Met` of rays from a place each, or of those of an image from one, and the blocks there."""
+    rows = jax.vmap(find, (None, 0, 0, 0, 0))
+    hits, normal = (find_from if directions.ndim == 3 else rows)(relief, origins, directions, blocks, limits)
+    finite = jnp.isfinite(jnp.sum(origins, axis=-1) + jnp.sum(directions, axis=-1))
+    ranges = jnp.where(finite, jnp.clip(hits.distance, 0.0, limits), jnp.nan)
+    return ranges, jnp.stack(normal, axis=-1), hits.entry < -1
 
 
 @_meet.defjvp
 @in_32_bits()
 def _meet_and_changes(primals: Any, tangents: Any) -> tuple[Any, Any]:
-    """Return what rays meet and how the ranges change; the same surface is met."""
-    ranges, change = _ranges_and_changes(primals, tangents)
-    _, normal, thing = _meet(*primals)
+    """Return what rays meet, and how the ranges change: a ray's end stays in the plane of what it meets."""
+    _, _, directions, _, limits = primals
+    _, moved, turned, _, widened = tangents
+    ranges, normal, thing = _meet(*primals)
+    facing = jnp.sum(normal * directions, axis=-1)
+    meets = (ranges < limits) & (jnp.abs(facing) > 0.0)
+    shift = jnp.sum(normal * (moved + ranges[..., None] * turned), axis=-1)
+    change = jnp.where(meets, -shift / jnp.where(meets, facing, 1.0), jnp.where(ranges >= limits, widened, 0.0))
     return (ranges, normal, thing), (change, jnp.zeros_like(normal), np.zeros(thing.shape, jax.dtypes.float0))
 
 
-@jax.custom_jvp
-@in_32_bits()
-def _meet_from(
-    relief: Relief, origin: Array, directions: Array, block: Array, limit: Array
-) -> tuple[Array, Array, Array]:
-    """`_meet` of rays from one place."""
-    return _surfaces(find_facing_from(relief, origin, directions, block, limit), origin, directions, limit)
-
-
-@_meet_from.defjvp
-@in_32_bits()
-def _meet_from_and_changes(primals: Any, tangents: Any) -> tuple[Any, Any]:
-    """Return what rays meet and how the ranges change, as if each had a place of its own."""
-    relief, origin, directions, block, limit = primals
-    image = directions.shape[:-1]
-    n = image[0] * image[1]
-    each = lambda part: jnp.broadcast_to(part, (n, *part.shape))  # noqa: E731
-    rows = relief, each(origin), directions.reshape(n, 3), each(block), each(limit)
-    turned, still = tangents[2].reshape(n, 3), np.zeros(n, jax.dtypes.float0)
-    found = _meet_and_changes(rows, (tangents[0], each(tangents[1]), turned, still, each(tangents[4])))
-    return jax.tree.map(lambda part: part.reshape(*image, *part.shape[1:]), found)
-
-
-def _require_pattern(directions: Float[Array, "*n 3"]) -> None:
+def require_pattern(directions: Any, axes: tuple[int, ...] = (2, 3)) -> None:
     """Check beams, as far as they are known before the program runs.
+
+    Args:
+        directions: Unit vectors.
+        axes: Numbers of axes that they may have.
 
     Raises:
         ValueError: There is no beam, or one is no number or no unit vector.
     """
-    if jnp.ndim(directions) not in (2, 3) or directions.shape[-1] != 3 or not directions.size:
+    if jnp.ndim(directions) not in axes or directions.shape[-1] != 3 or not directions.size:
+        shapes = " or ".join({2: "(n, 3)", 3: "(rows, columns, 3)"}[n] for n in axes)
         raise ValueError(
-            f"a pattern needs one or more beams as unit vectors (n, 3) or (rows, columns, 3), got shape "
-            f"{jnp.shape(directions)}"
+            f"a pattern needs one or more beams as unit vectors {shapes}, got shape {jnp.shape(directions)}"
         )
     if isinstance(directions, jax.core.Tracer):
         return
@@ -261,19 +247,10 @@ def block_at(relief: Relief, origin: Float[Array, "3"], station: Float[Array, ""
     last = relief.n_blocks - 1
     at = jnp.clip(jnp.floor(station / relief.length * relief.n_blocks), 0, last).astype(jnp.int32)
     row = relief.frame[relief.first_block + at]
-    local = rotate_into_frame(row, origin - row[:3])
-    ahead, behind = dot(row[16:19], local) > row[19], dot(row[12:15], local) < row[15]
+    # Written out: a library's product may round to TF32.
+    local = jnp.sum(row[3:12].reshape(3, 3) * (origin - row[:3]), axis=1)
+    ahead, behind = jnp.sum(row[16:19] * local) > row[19], jnp.sum(row[12:15] * local) < row[15]
     return relief.first_block + jnp.clip(at + ahead.astype(jnp.int32) - behind.astype(jnp.int32), 0, last)
-
-
-def rotate_into_frame(row: Float[Array, "n_frame"], vector: Float[Array, "3"]) -> Float[Array, "3"]:
-    """Turn a vector into a block's frame."""
-    return jnp.stack([dot(row[3:6], vector), dot(row[6:9], vector), dot(row[9:12], vector)])
-
-
-def dot(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, ""]:
-    """Return the scalar product, written out: a library may round to TF32."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def rotate(orientation: Float[Array, "4"], vectors: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
@@ -284,37 +261,3 @@ def rotate(orientation: Float[Array, "4"], vectors: Float[Array, "*n 3"]) -> Flo
     p, q, r = y * c - z * b + w * a, z * a - x * c + w * b, x * b - y * a + w * c
     turned = [a + 2.0 * (y * r - z * q), b + 2.0 * (z * p - x * r), c + 2.0 * (x * q - y * p)]
     return jnp.stack(turned, axis=-1)
-
-
-@jax.custom_jvp
-@in_32_bits()
-def _ranges(
-    relief: Relief,
-    origins: Float[Array, "n 3"],
-    directions: Float[Array, "n 3"],
-    blocks: Int[Array, "n"],
-    limits: Float[Array, "n"],
-) -> Float[Array, "n"]:
-    """Return the ranges of rays, each from the block around its origin."""
-    return _clip(find(relief, origins, directions, blocks, limits), origins, directions, limits)
-
-
-def _clip(hits: Hits, origins: Array, directions: Array, limits: Array) -> Float[Array, "*n"]:
-    finite = jnp.isfinite(jnp.sum(origins, axis=-1) + jnp.sum(directions, axis=-1))
-    return jnp.where(finite, jnp.clip(hits.distance, 0.0, limits), jnp.nan)
-
-
-@_ranges.defjvp
-@in_32_bits()
-def _ranges_and_changes(primals: Any, tangents: Any) -> tuple[Array, Array]:
-    """Return ranges and their changes: a ray's end stays in the plane of the triangle that it meets."""
-    relief, origins, directions, blocks, limits = primals
-    _, moved, turned, _, widened = tangents
-    hits, rows = find_facing(relief, origins, directions, blocks, limits)
-    ranges, normal = _clip(hits, origins, directions, limits), jnp.stack(rows, axis=-1)
-    facing = jnp.sum(normal * directions, axis=-1)
-    meets = (hits.entry != -1) & (hits.distance < limits) & (jnp.abs(facing) > 0.0)
-    shift = jnp.sum(normal * (moved + ranges[:, None] * turned), axis=-1)
-    return ranges, jnp.where(
-        meets, -shift / jnp.where(meets, facing, 1.0), jnp.where(hits.distance >= limits, widened, 0.0)
-    )

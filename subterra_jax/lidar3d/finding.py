@@ -1,21 +1,21 @@
-"""Finds what rays meet in a relief by the fastest program for the device, all rays of any number of `vmap`s at once."""
+"""Finds what rays meet in a relief, all rays of any number of `vmap`s at once."""
 
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Float, Int
 
-from subterra_jax import native
 from subterra_jax.compiled import in_32_bits
 from subterra_jax.host.errors import SubterraError
+from subterra_jax.lidar import nvidia
+from subterra_jax.lidar.kernels import compiled_by_numba, fastest
 from subterra_jax.lidar3d import fused
 from subterra_jax.lidar3d.meeting import Hits, Point, Tools, normals
 from subterra_jax.lidar3d.relay import march_in_relay
 from subterra_jax.lidar3d.relief import ARRAYS, Relief
-from subterra_jax.rows import axes, rowwise, spread
+from subterra_jax.rows import rowwise
 
 # Memory of a ray, bytes: origin, direction, block, limit, distance, entry, block again, each once more as a row.
 _BYTES = 2 * 4 * 11
@@ -59,112 +59,59 @@ def tools_of(relief: Relief) -> Tools:
     return Tools(load, lambda a, b, c: a * b + c, lambda a: 1.0 / a)
 
 
-def _by_platform(in_step: Any, on_gpu: Any, on_cpu: Any, relief: Relief, rows: Any) -> Any:
-    """Call what is fastest on the device: the fused kernel, machine code, or XLA's `in_step`."""
-    _require_memory(len(rows[2]))
-    kernels: dict[str, Any] = {}
-    if fused.supported():
-        kernels["cuda"] = on_gpu
-    if native.supported():
-        kernels["cpu"] = on_cpu
-    return lax.platform_dependent(relief, *rows, **kernels, default=in_step)
-
-
-def _merged(find_rays: Any, in_step: Any, axis_size: int, batched: Any, relief: Relief, rows: Any) -> tuple[Any, Any]:
-    """Merge a batch axis into the rays; find those of each relief by themselves if the reliefs differ."""
-    if any(jax.tree.leaves(batched[0])):
-        found = jax.vmap(in_step, in_axes=axes(batched))(relief, *rows)
-    else:
-        rows = spread(tuple(map(jnp.asarray, rows)), batched[1:], axis_size)
-        flat = find_rays(relief, *(row.reshape(-1, *row.shape[2:]) for row in rows))
-        found = jax.tree.map(lambda part: part.reshape(axis_size, -1), flat)
-    return found, jax.tree.map(lambda part: True, found)
-
-
-@custom_vmap
-@in_32_bits()
-def find(
-    relief: Relief,
-    origins: Float[Array, "n 3"],
-    directions: Float[Array, "n 3"],
-    blocks: Int[Array, "n"],
-    limits: Float[Array, "n"],
-) -> Hits:
-    """Find the first triangle that each ray meets, by the fastest means at hand."""
-    return _by_platform(find_in_step, fused.find, _find_natively, relief, (origins, directions, blocks, limits))
-
-
-@find.def_vmap
-@in_32_bits()
-def _find_more(axis_size: int, batched: Any, relief: Relief, *rows: Any) -> tuple[Hits, Hits]:
-    """Merge a batch axis into the rays."""
-    return _merged(find, find_in_step, axis_size, batched, relief, rows)
-
-
-@custom_vmap
-@in_32_bits()
-def find_facing(
+def by_xla(
     relief: Relief,
     origins: Float[Array, "n 3"],
     directions: Float[Array, "n 3"],
     blocks: Int[Array, "n"],
     limits: Float[Array, "n"],
 ) -> tuple[Hits, Point]:
-    """Find the first triangle that each ray meets, and its normal, by the fastest means at hand."""
-    rows = (origins, directions, blocks, limits)
-    return _by_platform(facing_in_step, fused.find_facing, _facing_natively, relief, rows)
+    """Find the first triangle that each ray meets, and its normal, by XLA."""
+    tools = tools_of(relief)
+    hits = march_in_relay(tools, relief.n_x, origins, directions, blocks, limits)
+    return hits, normals(tools, tuple(origins.T), tuple(directions.T), hits)
 
 
-@find_facing.def_vmap
+def by_numba(relief: Relief, *rows: Any) -> tuple[Hits, Point]:
+    """Find the first triangles by machine code, and their normals by XLA; arguments as for `by_xla`."""
+    arrays = tuple(getattr(relief, name) for name in ARRAYS)
+    hits = Hits(*compiled_by_numba("march")(arrays, relief.n_x, *rows))
+    return hits, normals(tools_of(relief), tuple(rows[0].T), tuple(rows[1].T), hits)
+
+
 @in_32_bits()
-def _find_more_facing(axis_size: int, batched: Any, relief: Relief, *rows: Any) -> tuple[Any, Any]:
-    """Merge a batch axis into the rays."""
-    return _merged(find_facing, facing_in_step, axis_size, batched, relief, rows)
+def _one(relief: Relief, *row: Array) -> tuple[Hits, Point]:
+    """`by_xla` of one ray."""
+    return jax.tree.map(lambda part: part[0], by_xla(relief, *(part[None] for part in row)))
 
 
-def _facing_from_one(relief: Relief, origin: Array, directions: Array, block: Array, limit: Array) -> Any:
+@in_32_bits()
+def _many(relief: Relief, *rows: Array) -> tuple[Hits, Point]:
+    """`by_xla` by the fastest means at hand."""
+    _require_memory(len(rows[2]))
+    return fastest(by_xla, fused.find, by_numba)(relief, *rows)
+
+
+# Of a relief, an origin (m), a unit vector, the block around the origin, and the largest distance of interest (m).
+find = rowwise(_one, _many)
+
+
+def _image(relief: Relief, origin: Array, directions: Array, block: Array, limit: Array) -> tuple[Hits, Point]:
     """Find what the rays of an image meet, each as if it had a place of its own."""
-    image = directions.shape[:-1]
-    n = image[0] * image[1]
-    rows = jnp.broadcast_to(origin, (n, 3)), directions.reshape(n, 3), *(jnp.broadcast_to(x, n) for x in (block, limit))
-    return jax.tree.map(lambda part: part.reshape(image), find_facing(relief, *rows))
+    along_row = jax.vmap(find, (None, None, 0, None, None))
+    return jax.vmap(along_row, (None, None, 0, None, None))(relief, origin, directions, block, limit)
 
 
-def _facing_from_many(relief: Relief, origins: Array, directions: Array, blocks: Array, limits: Array) -> Any:
+@in_32_bits()
+def _images(relief: Relief, origins: Array, directions: Array, blocks: Array, limits: Array) -> tuple[Hits, Point]:
     """Find what the rays of many scans meet."""
-    apart = jax.vmap(_facing_from_one, (None, 0, 0, 0, 0))
-    if not fused.supported() or directions.shape[1] * directions.shape[2] % fused.ROWS:
+    apart = jax.vmap(_image, (None, 0, 0, 0, 0))
+    if not nvidia.present() or directions.shape[1] * directions.shape[2] % fused.ROWS:
         return apart(relief, origins, directions, blocks, limits)
     _require_memory(directions.size // 3)
     rows = origins, directions, blocks, limits
-    return lax.platform_dependent(relief, *rows, cuda=fused.find_facing_from, default=apart)
+    return fastest(apart, fused.find, apart)(relief, *rows)
 
 
-find_facing_from = rowwise(_facing_from_one, in_32_bits()(_facing_from_many))
-
-
-def find_in_step(relief: Relief, origins: Array, directions: Array, blocks: Array, limits: Array) -> Hits:
-    """Find the first triangles by XLA."""
-    return march_in_relay(tools_of(relief), relief.n_x, origins, directions, blocks, limits)
-
-
-def _find_natively(relief: Relief, *rows: Array) -> Hits:
-    """Find the first triangles by machine code."""
-    from subterra_jax.native import marchcall  # numba is optional
-
-    return marchcall.find(relief, *rows)
-
-
-def facing_in_step(relief: Relief, *rows: Array) -> tuple[Hits, Point]:
-    """Find the first triangles and their normals by XLA."""
-    return _with_normals(relief, find_in_step(relief, *rows), rows)
-
-
-def _facing_natively(relief: Relief, *rows: Array) -> tuple[Hits, Point]:
-    """Find the first triangles by machine code, and their normals by XLA."""
-    return _with_normals(relief, _find_natively(relief, *rows), rows)
-
-
-def _with_normals(relief: Relief, hits: Hits, rows: Any) -> tuple[Hits, Point]:
-    origins, directions = rows[:2]
-    return hits, normals(tools_of(relief), tuple(origins.T), tuple(directions.T), hits)
+# The same of an origin and the unit vectors of an image from there.
+find_from = rowwise(_image, _images)

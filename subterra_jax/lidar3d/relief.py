@@ -153,11 +153,6 @@ class Relief:
         sizes: dict[str, Any] = {name: grown(getattr(self, name), getattr(other, name)) for name in ARRAYS}
         return dataclasses.replace(self, **sizes)
 
-    @property
-    def n_bytes(self) -> int:
-        """Memory on the device, bytes."""
-        return sum(np.asarray(leaf).nbytes if np.isscalar(leaf) else leaf.nbytes for leaf in jax.tree.leaves(self))
-
 
 def stack_reliefs(reliefs: Sequence[Relief]) -> Relief:
     """Join several bores into one `Relief`, whose `pick(i)` gives the i-th.

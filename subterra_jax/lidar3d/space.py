@@ -94,13 +94,9 @@ def ground_at(tunnel: Any, station: Float[Array, ""]) -> tuple[Float[Array, ""],
 
 
 def level_axes(rise: Array, tangent_x: Array, tangent_y: Array, heading: Array) -> tuple[Rows, Rows, Rows]:
-    """Return the axes ahead, left and up of a robot on ground that rises along the axis and is level across it.
+    """Return the axes ahead, left and up of a robot on ground that rises along the axis (m/m) and is level across it.
 
-    Args:
-        rise: Rise of the ground along the axis, m/m.
-        tangent_x: Tangent of the axis in plan; its length does not matter.
-        tangent_y: Its second part.
-        heading: Heading of the robot in plan, rad.
+    The tangent of the axis in plan need be no unit vector; the heading is in plan too, rad.
     """
     level = 1.0 / jnp.sqrt(tangent_x**2 + tangent_y**2)
     slope_x, slope_y = rise * tangent_x * level, rise * tangent_y * level

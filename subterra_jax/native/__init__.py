@@ -5,6 +5,7 @@ the time.
 """
 
 import functools
+import importlib.util
 import os
 import re
 import sys
@@ -14,7 +15,7 @@ from pathlib import Path
 import jax
 
 # Versions of XLA's custom-call interface that `frames.py` was written for: 0.2 in jaxlib 0.9 to 0.5 in jaxlib 0.12.
-FFI_MAJOR, FFI_FIRST_MINOR, FFI_LAST_MINOR = 0, 2, 5
+FFI_VERSIONS = ((0, 2), (0, 3), (0, 4), (0, 5))
 
 
 @functools.cache
@@ -26,33 +27,21 @@ def supported() -> bool:
     # `frames.py` reads XLA's structs as a 64-bit POSIX system lays them out.
     if jax.default_backend() != "cpu" or os.name != "posix" or sys.maxsize < 2**32:
         return False
-    try:
-        import numba  # noqa: F401
-    except ImportError:
+    if importlib.util.find_spec("numba") is None:
         return False
-    if problem := version_problem(Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h"):
-        warnings.warn(problem, RuntimeWarning, stacklevel=2)
+    version = _ffi_version(Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h")
+    if version not in FFI_VERSIONS:
+        warnings.warn(
+            f"jaxlib has version {version} of XLA's custom-call interface, and the CPU kernels know "
+            f"{FFI_VERSIONS[0]} to {FFI_VERSIONS[-1]}: XLA casts the LiDAR instead, about 4 times slower",
+            RuntimeWarning,
+            stacklevel=2,
+        )
         return False
     return True
 
 
-def version_problem(header: Path) -> str | None:
-    """Return one sentence if jaxlib's custom-call interface is not one that `frames.py` knows; `None` if it is.
-
-    Args:
-        header: `c_api.h` of the installed jaxlib, which states the version.
-    """
-    known = f"{FFI_MAJOR}.{FFI_FIRST_MINOR} to {FFI_MAJOR}.{FFI_LAST_MINOR}"
-    try:
-        text = header.read_text(encoding="utf-8")
-    except OSError:
-        text = ""
-    numbers = [re.search(rf"#define XLA_FFI_API_{part} (\d+)", text) for part in ("MAJOR", "MINOR")]
-    if numbers[0] is None or numbers[1] is None:
-        problem = f"jaxlib does not state the version of its custom-call interface in {header}"
-    else:
-        major, minor = int(numbers[0][1]), int(numbers[1][1])
-        if major == FFI_MAJOR and FFI_FIRST_MINOR <= minor <= FFI_LAST_MINOR:
-            return None
-        problem = f"jaxlib has version {major}.{minor} of the custom-call interface"
-    return f"{problem}, and the CPU kernels are written for {known}: XLA casts the LiDAR instead, about 4 times slower"
+def _ffi_version(header: Path) -> tuple[int, ...]:
+    """Return the version of the interface that jaxlib's header states; empty if it states none."""
+    text = header.read_text(encoding="utf-8") if header.is_file() else ""
+    return tuple(int(number) for number in re.findall(r"#define XLA_FFI_API_(?:MAJOR|MINOR) (\d+)", text))

@@ -1,157 +1,104 @@
-"""XLA's custom calls without a C compiler: its structs read by address, and its threads put to work.
+"""XLA's custom calls without a C compiler: its structs by the names of their fields, and its threads put to work.
 
-Source: `xla/ffi/api/c_api.h` of jaxlib 0.9 to 0.12, interface 0.2 to 0.5. Offsets are those of a machine with pointers
-of 8 bytes.
-
-The calling thread takes chunks of rows like every helper, and waits only for chunks that a helper has begun. A helper
-that starts late or never finds nothing left to do, so a busy pool cannot block the call.
+Source: `xla/ffi/api/c_api.h` of jaxlib 0.9 to 0.12, interface 0.2 to 0.5, on a machine with pointers of 8 bytes.
 """
 
-import ctypes
 from collections.abc import Callable
+from types import FunctionType
 from typing import Any, no_type_check
 
-from llvmlite import ir
-from numba import carray, njit, types
+import numpy as np
+from llvmlite import binding, ir
+from numba import carray, cfunc, from_dtype, njit, types
+from numba.core import cgutils
 from numba.core.typing.templates import signature
 from numba.extending import intrinsic
 
-from subterra_jax.native import FFI_FIRST_MINOR, FFI_LAST_MINOR, FFI_MAJOR
-
-# XLA_FFI_CallFrame: extension_start, api, ctx, stage, args.args, rets.rets; XLA_FFI_Buffer: data, rank, dims.
-_API, _CONTEXT = 16, 24
-_EXTENSION, _STAGE, _ARGS, _RESULTS = 8, 32, 72, 112
-_DATA, _RANK, _DIMS = 24, 32, 40
-# XLA_FFI_Metadata_Extension: metadata; XLA_FFI_Metadata and XLA_FFI_Api: api_version.major_version, .minor_version.
-_METADATA, _META_MAJOR, _META_MINOR, _API_MAJOR, _API_MINOR = 24, 24, 28, 32, 36
-_EXECUTE = 3
+_WORD = ir.IntType(64)
+_EXECUTE = 3  # XLA_FFI_ExecutionStage_EXECUTE
 
 
-def _pointer(builder: ir.IRBuilder, address: ir.Value, element: ir.Type) -> ir.Value:
-    return builder.inttoptr(address, element.as_pointer())
+def _struct(**fields: Any) -> np.dtype:
+    """Lay a struct out as C does; XLA's begin with their size and a list of extensions."""
+    return np.dtype([("struct_size", "i8"), ("extension", "i8"), *fields.items()], align=True)
 
 
-@intrinsic
-def read64(typing: Any, address: Any) -> Any:
-    """Read the 8-byte integer, or pointer, at an address."""
-    return signature(types.int64, types.intp), lambda context, builder, sig, args: builder.load(
-        _pointer(builder, args[0], ir.IntType(64))
-    )
+_VERSION = _struct(major="i4", minor="i4")
+_LIST = _struct(size="i8", types="i8", items="i8")
+_FRAME = _struct(api="i8", context="i8", stage="i4", args=_LIST, rets=_LIST)
+_BUFFER = _struct(kind="i4", data="i8", rank="i8", dims="i8")
+_METADATA_EXTENSION = _struct(following="i8", metadata="i8")
+_METADATA = np.dtype([("struct_size", "i8"), ("version", _VERSION)])
+_API = _struct(version=_VERSION, internal="i8", others=("i8", 11), schedule="i8", num_threads="i8")
+_REQUEST = _struct(context="i8", first="i8", second="i8")  # arguments of the last two
+# Rows not yet taken, rows done, threads that still use the job; the call and its rows; a request and its answer.
+_JOB = np.dtype(
+    [(name, "i8") for name in ("next", "done", "holders", "frame", "rows", "answer")] + [("request", _REQUEST)]
+)
+_NEXT, _DONE, _HOLDERS, _, _, _ANSWER, _ASKED = range(0, 56, 8)  # where these are in a job
+_JOB_SIZE, _API_SIZE = _JOB.itemsize, _API.itemsize
 
 
-@intrinsic
-def read32(typing: Any, address: Any) -> Any:
-    """Read the 4-byte integer at an address."""
-    return signature(types.int32, types.intp), lambda context, builder, sig, args: builder.load(
-        _pointer(builder, args[0], ir.IntType(32))
-    )
-
-
-def _writer(kind: Any) -> Any:
-    """Return a compiled function that writes an integer to an address."""
+def _at(kind: types.Type) -> Any:
+    """Return a compiled function that takes an address for a record or a pointer."""
 
     @intrinsic
-    def write(typing: Any, address: Any, value: Any) -> Any:
-        def emit(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
-            builder.store(args[1], _pointer(builder, args[0], ir.IntType(kind.bitwidth)))
-            return context.get_dummy_value()
+    def at(typing: Any, address: Any) -> Any:
+        return signature(kind, types.intp), lambda context, builder, sig, args: builder.inttoptr(
+            args[0], context.get_value_type(kind)
+        )
 
-        return signature(types.void, types.intp, kind), emit
-
-    return write
+    return at
 
 
-write32, write64 = _writer(types.int32), _writer(types.int64)
-
-
-@intrinsic
-def _floats_at(typing: Any, address: Any) -> Any:
-    return signature(types.CPointer(types.float32), types.intp), lambda context, builder, sig, args: _pointer(
-        builder, args[0], ir.FloatType()
-    )
-
-
-@intrinsic
-def _ints_at(typing: Any, address: Any) -> Any:
-    return signature(types.CPointer(types.int32), types.intp), lambda context, builder, sig, args: _pointer(
-        builder, args[0], ir.IntType(32)
-    )
+_frame_at, _buffer_at, _extension_at, _metadata_at, _api_at, _job_at = (
+    _at(from_dtype(struct)) for struct in (_FRAME, _BUFFER, _METADATA_EXTENSION, _METADATA, _API, _JOB)
+)
+_words_at, _floats_at = (_at(types.CPointer(kind)) for kind in (types.int64, types.float32))
 
 
 @njit
 @no_type_check
-def wants_work(frame):
-    """Return whether XLA asks for results. If it asks for the handler's version instead, answer that.
+def _wants_work(frame):
+    """Return whether XLA asks for results. If it asks for the handler's version instead, answer that: XLA's own."""
+    call = _frame_at(frame)
+    if call.extension == 0:
+        return call.stage == _EXECUTE
+    ours, theirs = _metadata_at(_extension_at(call.extension).metadata).version, _api_at(call.api).version
+    ours.major = theirs.major
+    ours.minor = theirs.minor
+    return False
 
-    The answer is XLA's own version if the structs are known to lie in memory as read here, else the nearest that is:
-    XLA then refuses the handler unless it supports that version.
-    """
-    extension = read64(frame + _EXTENSION)
-    if extension != 0:
-        metadata, api = read64(extension + _METADATA), read64(frame + _API)
-        minor = read32(api + _API_MINOR) if read32(api + _API_MAJOR) == FFI_MAJOR else FFI_LAST_MINOR
-        write32(metadata + _META_MAJOR, FFI_MAJOR)
-        write32(metadata + _META_MINOR, min(max(minor, FFI_FIRST_MINOR), FFI_LAST_MINOR))
-        return False
-    return read32(frame + _STAGE) == _EXECUTE
+
+@njit
+@no_type_check
+def _flat(address):
+    buffer, count = _buffer_at(address), 1
+    for axis in range(buffer.rank):
+        count *= _words_at(buffer.dims)[axis]
+    return carray(_floats_at(buffer.data), (count,))
 
 
 @njit
 @no_type_check
 def argument(frame, i):
-    """Return the address of the i-th argument's buffer."""
-    return read64(read64(frame + _ARGS) + 8 * i)
+    """Return the i-th argument as a flat array of float32; `.view` gives other numbers of 32 bits."""
+    return _flat(_words_at(_frame_at(frame).args.items)[i])
 
 
 @njit
 @no_type_check
 def result(frame, i):
-    """Return the address of the i-th result's buffer."""
-    return read64(read64(frame + _RESULTS) + 8 * i)
+    """Return the i-th result, as `argument`."""
+    return _flat(_words_at(_frame_at(frame).rets.items)[i])
 
 
 @njit
 @no_type_check
-def size(buffer, axis):
-    """Return the length of an axis of a buffer."""
-    return read64(read64(buffer + _DIMS) + 8 * axis)
+def length(frame, i, axis):
+    """Return the length of an axis of the i-th argument."""
+    return _words_at(_buffer_at(_words_at(_frame_at(frame).args.items)[i]).dims)[axis]
 
-
-@njit
-@no_type_check
-def _count(buffer):
-    count = 1
-    for axis in range(read64(buffer + _RANK)):
-        count *= size(buffer, axis)
-    return count
-
-
-@njit
-@no_type_check
-def floats(buffer):
-    """Return a float32 buffer as a flat array."""
-    return carray(_floats_at(read64(buffer + _DATA)), (_count(buffer),))
-
-
-@njit
-@no_type_check
-def ints(buffer):
-    """Return an int32 buffer as a flat array."""
-    return carray(_ints_at(read64(buffer + _DATA)), (_count(buffer),))
-
-
-def capsule(address: int) -> Any:
-    """Wrap a function's address for `jax.ffi.register_ffi_target`."""
-    new = ctypes.pythonapi.PyCapsule_New
-    new.restype, new.argtypes = ctypes.py_object, [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p]
-    return new(address, None, None)
-
-
-# XLA_FFI_Api: struct_size, XLA_FFI_ThreadPool_Schedule, XLA_FFI_ThreadPool_NumThreads.
-_API_SIZE, _SCHEDULE, _NUM_THREADS, _KNOWN_API_SIZE = 0, 136, 144, 152
-# A job: the call frame, first row not yet taken, rows, rows done, threads that still use the job, arguments of the two
-# functions above and their answer.
-_FRAME, _NEXT, _ROWS, _DONE, _HOLDERS, _REQUEST, _ANSWER, _JOB_SIZE = 0, 8, 16, 24, 32, 40, 80, 88
 
 _allocate = types.ExternalFunction("malloc", signature(types.intp, types.intp))
 _release = types.ExternalFunction("free", signature(types.void, types.intp))
@@ -161,135 +108,122 @@ _yield_thread = types.ExternalFunction("sched_yield", signature(types.int32))
 @intrinsic
 def _fetch_add(typing: Any, address: Any, value: Any) -> Any:
     """Add to an 8-byte integer atomically; return its value before."""
-
-    def emit(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
-        pointer = builder.inttoptr(args[0], ir.IntType(64).as_pointer())
-        return builder.atomic_rmw("add", pointer, args[1], "seq_cst")
-
-    return signature(types.int64, types.intp, types.int64), emit
+    return signature(types.int64, types.intp, types.int64), lambda context, builder, sig, args: builder.atomic_rmw(
+        "add", builder.inttoptr(args[0], _WORD.as_pointer()), args[1], "seq_cst"
+    )
 
 
 @intrinsic
-def _call_at(typing: Any, address: Any, argument: Any) -> Any:
+def _call(typing: Any, function: Any, argument: Any) -> Any:
     """Call the C function at an address with one pointer; return the pointer that it returns."""
-
-    def emit(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
-        word = ir.IntType(64)
-        return builder.call(builder.inttoptr(args[0], ir.FunctionType(word, [word]).as_pointer()), [args[1]])
-
-    return signature(types.intp, types.intp, types.intp), emit
+    kind = ir.FunctionType(_WORD, [_WORD])
+    return signature(types.intp, types.intp, types.intp), lambda context, builder, sig, args: builder.call(
+        builder.inttoptr(args[0], kind.as_pointer()), [args[1]]
+    )
 
 
-def _compile_as(name: str) -> Callable[[Callable[..., Any]], Any]:
-    """Return a decorator that compiles a function under a name of its own.
-
-    Numba numbers the functions of one name anew in every process. Code that two processes have put on disk is linked
-    by these names, so that a third process would take one function for another of the same name and number.
-    """
-
-    def compile_named(function: Callable[..., Any]) -> Any:
-        function.__name__ = f"{name}_{function.__name__}"
-        function.__qualname__ = f"{function.__qualname__}.{name}"
-        return njit(function)
-
-    return compile_named
+@njit
+@no_type_check
+def _ask(function, job, first, second):
+    """Call a function of XLA's thread pool; return 0 on success."""
+    asked = _job_at(job).request
+    asked.struct_size = 40 if second else 32
+    asked.extension = 0
+    asked.context = _frame_at(_job_at(job).frame).context
+    asked.first = first
+    asked.second = second
+    return _call(function, job + _ASKED)
 
 
-def _as_c_function(function: Callable[..., Any], name: str) -> Any:
-    """Make a compiled function of one integer a C function of one pointer; return a function that gives its address."""
+@njit
+@no_type_check
+def _leave(job):
+    if _fetch_add(job + _HOLDERS, -1) == 1:
+        _release(job)
 
-    def forward(job: Any) -> None:
-        function(job)
 
-    forward.__qualname__ = f"{forward.__qualname__}.{name}"
+# Of each kernel: `handler_of` puts its own in their place.
+work, chunk, take_chunks, helper = None, 1, None, None
+
+
+@no_type_check
+def _take_chunks(job):
+    frame, rows = _job_at(job).frame, _job_at(job).rows
+    begin = _fetch_add(job + _NEXT, chunk)
+    while begin < rows:
+        end = min(begin + chunk, rows)
+        work(frame, begin, end)
+        _fetch_add(job + _DONE, end - begin)
+        begin = _fetch_add(job + _NEXT, chunk)
+
+
+@no_type_check
+def _help_once(job):
+    take_chunks(job)
+    _leave(job)
+
+
+@no_type_check
+def _answer(frame):
+    if not _wants_work(frame):
+        return 0
+    rows, api = length(frame, 0, 0), _api_at(_frame_at(frame).api)
+    if rows < 2 * chunk or api.struct_size < _API_SIZE:
+        work(frame, 0, rows)
+        return 0
+    job = _allocate(_JOB_SIZE)
+    this = _job_at(job)
+    this.frame, this.rows, this.next, this.done, this.answer = frame, rows, 0, 0, 1
+    _ask(api.num_threads, job, job + _ANSWER, 0)
+    helpers = min(this.answer, (rows + chunk - 1) // chunk) - 1
+    this.holders = helpers + 1
+    for _ in range(helpers):
+        if _ask(api.schedule, job, helper(), job) != 0:
+            _leave(job)
+    take_chunks(job)
+    while _fetch_add(job + _DONE, 0) < rows:
+        _yield_thread()
+    _leave(job)
+    return 0
+
+
+def _address_of(symbol: str) -> Any:
+    """Return a compiled function that gives the address of a C function."""
 
     @intrinsic
     def address(typing: Any) -> Any:
         def emit(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
-            word, inner = ir.IntType(64), signature(types.none, types.intp)
-            entry = ir.Function(builder.module, ir.FunctionType(ir.VoidType(), [word]), name)
-            entry.linkage = "internal"
-            inside = ir.IRBuilder(entry.append_basic_block())
-            body = context.compile_subroutine(inside, forward, inner)
-            context.call_internal_no_propagate(inside, body.fndesc, inner, entry.args)
-            inside.ret_void()
-            return builder.ptrtoint(entry, word)
+            kind = ir.FunctionType(ir.VoidType(), [_WORD])
+            return builder.ptrtoint(cgutils.get_or_insert_function(builder.module, kind, symbol), _WORD)
 
         return signature(types.intp), emit
 
     return address
 
 
-@njit
-@no_type_check
-def _ask(frame, job, function, third, fourth, size):
-    """Call one of the two functions of XLA's thread pool; return 0 on success."""
-    request = job + _REQUEST
-    write64(request, size)
-    write64(request + 8, 0)
-    write64(request + 16, read64(frame + _CONTEXT))
-    write64(request + 24, third)
-    write64(request + 32, fourth)
-    return _call_at(read64(read64(frame + _API) + function), request)
+def handler_of(work: Callable[..., None], chunk: int, name: str, cache: bool) -> tuple[Any, Any]:
+    """Return a handler of XLA's that does the rows of a call on all threads of its pool, and its helper.
 
-
-def run_on_all_threads(work: Callable[..., None], chunk: int, name: str) -> Any:
-    """Make `work(frame, begin, end)` into `run(frame, rows)`, which does all rows on all threads of XLA's pool.
+    The calling thread takes chunks of rows like every helper, and waits only for chunks that a helper has begun. A
+    helper that starts late or never finds nothing left to do, so a busy pool cannot block the call.
 
     Args:
-        work: Compiled function that does some rows of a call.
+        work: Compiled function of a call's frame and the first row and the one after the last; the first axis of the
+            first argument counts rows.
         chunk: Rows to take at a time; fewer than two chunks are not shared.
-        name: Name of the helpers' code; must be unique.
+        name: Name of the kernel; must be unique.
+        cache: Keep the machine code on disk.
     """
 
-    @_compile_as(name)
-    @no_type_check
-    def take_chunks(job):
-        frame, rows = read64(job + _FRAME), read64(job + _ROWS)
-        while True:
-            begin = _fetch_add(job + _NEXT, chunk)
-            if begin >= rows:
-                return
-            end = min(begin + chunk, rows)
-            work(frame, begin, end)
-            _fetch_add(job + _DONE, end - begin)
+    def own(function: Callable[..., Any], **others: Any) -> Callable[..., Any]:
+        # Numba numbers functions of one name anew in every process: code of two of them on disk would be mixed up. And
+        # it takes a closure for another one in every process.
+        made = FunctionType(function.__code__, {**globals(), "work": work, "chunk": chunk, **others})
+        made.__name__ = made.__qualname__ = name + function.__name__
+        return made
 
-    @_compile_as(name)
-    @no_type_check
-    def leave(job):
-        if _fetch_add(job + _HOLDERS, -1) == 1:
-            _release(job)
-
-    @_compile_as(name)
-    @no_type_check
-    def help_once(job):
-        take_chunks(job)
-        leave(job)
-
-    helper = _as_c_function(help_once, name)
-
-    @_compile_as(name)
-    @no_type_check
-    def run(frame, rows):
-        api = read64(frame + _API)
-        if rows < 2 * chunk or read64(api + _API_SIZE) < _KNOWN_API_SIZE:
-            work(frame, 0, rows)
-            return
-        job = _allocate(_JOB_SIZE)
-        write64(job + _FRAME, frame)
-        write64(job + _NEXT, 0)
-        write64(job + _ROWS, rows)
-        write64(job + _DONE, 0)
-        write64(job + _ANSWER, 1)
-        _ask(frame, job, _NUM_THREADS, job + _ANSWER, 0, 32)
-        helpers = min(read64(job + _ANSWER), (rows + chunk - 1) // chunk) - 1
-        write64(job + _HOLDERS, helpers + 1)
-        for _ in range(helpers):
-            if _ask(frame, job, _SCHEDULE, helper(), job, 40) != 0:
-                leave(job)
-        take_chunks(job)
-        while _fetch_add(job + _DONE, 0) < rows:
-            _yield_thread()
-        leave(job)
-
-    return run
+    shared, symbol = njit(own(_take_chunks)), f"{name}_helper"
+    help_once = cfunc(types.void(types.intp), cache=cache)(own(_help_once, take_chunks=shared))
+    binding.add_symbol(symbol, help_once.address)
+    answer = own(_answer, take_chunks=shared, helper=_address_of(symbol))
+    return cfunc(types.intp(types.intp), cache=cache)(answer), help_once

@@ -11,9 +11,10 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
+from subterra_jax.native.frames import argument, length, result
 from subterra_jax.tunnel import GROUP, WIDTH
 
-_F, _U = np.float32, np.uint64
+_F, _I, _U = np.float32, np.int32, np.uint64
 _ZERO, _ONE, _JOINT = _F(0.0), _F(1.0), _F(2e-7)
 _GROUP, _HALF, _WIDTH, _NONE, _LARGEST = _U(GROUP), _U(GROUP // 2), _U(WIDTH), np.int32(0), np.int32(2**31 - 1)
 
@@ -82,23 +83,16 @@ def _look(box, n, wall, n_vertices, low, x, y, d_x, d_y, ahead, behind, enters, 
 
 @compiled
 @no_type_check
-def scan_rows(begin, end, start, wanted, position, heading, box, wall, n_vertices, turn, limit, ranges):
-    """Take the scans `begin` to `end`; all arrays are flat.
-
-    Args:
-        begin: First scan to take.
-        end: One after the last.
-        start: First block that each scan visits.
-        wanted: 0 where the ranges may be anything.
-        position: Position x, y of each scan, m.
-        heading: Their headings, rad.
-        box: The tunnel's boxes.
-        wall: The tunnel's walls.
-        n_vertices: Vertices of a block.
-        turn: Cosines of the beams' bearings, then sines.
-        limit: Largest range, m.
-        ranges: Output, ranges, m.
-    """
+def scan_rows(call, begin, end):
+    """Take the scans `begin` to `end` of a call: start, wanted, position, heading, box, wall, turn, limit to ranges."""
+    start, wanted, position, heading = (
+        argument(call, 0).view(_I),
+        argument(call, 1).view(_I),
+        argument(call, 2),
+        argument(call, 3),
+    )
+    box, wall, n_vertices = argument(call, 4), argument(call, 5), _U(length(call, 5, 2))
+    turn, limit, ranges = argument(call, 6), argument(call, 7)[0], result(call, 0)
     n, n_beams = _U(len(box) // 10), _U(len(turn) // 2)
     both = n_beams % _U(2) == _U(0)  # opposite beams share a line
     n_lines = n_beams // _U(2) if both else n_beams
@@ -157,20 +151,10 @@ def _squared(wall, n_vertices, block, m_x, m_y, best, work, bits):
 
 @compiled
 @no_type_check
-def clearance_rows(begin, end, start, position, box, wall, n_vertices, reach, distance):
-    """Measure the clearances `begin` to `end`; all arrays are flat.
-
-    Args:
-        begin: First point to look at.
-        end: One after the last.
-        start: First block that each point visits.
-        position: Points x, y, m.
-        box: The tunnel's boxes.
-        wall: The tunnel's walls.
-        n_vertices: Vertices of a block.
-        reach: Largest distance to report, m.
-        distance: Output, distances, m.
-    """
+def clearance_rows(call, begin, end):
+    """Measure the clearances `begin` to `end` of a call: start, position, box, wall, reach to distances."""
+    start, position, box, wall = argument(call, 0).view(_I), argument(call, 1), argument(call, 2), argument(call, 3)
+    n_vertices, reach, distance = _U(length(call, 3, 2)), argument(call, 4)[0], result(call, 0)
     n = _U(len(box) // 10)
     work = np.empty(WIDTH, np.float32)
     bits = work.view(np.int32)
@@ -183,11 +167,11 @@ def clearance_rows(begin, end, start, position, box, wall, n_vertices, reach, di
                 gap = way * (box[_U(6) * n + i] * m_x + box[_U(7) * n + i] * m_y) + box[_U(8 + side) * n + i]
                 if gap > _ZERO and gap * gap > best:
                     break
-                e_x, e_y, length = box[_U(2) * n + i], box[_U(3) * n + i], box[_U(5) * n + i]
+                e_x, e_y, half = box[_U(2) * n + i], box[_U(3) * n + i], box[_U(5) * n + i]
                 # Not the best so far: from within a pocket its wall is nearer than the box, whose lid closes it.
                 near = reach + box[_U(4) * n + i] + _F(1e-5)
-                beside = abs(m_x * e_y - m_y * e_x) <= near * length
-                if beside and abs(m_x * e_x + m_y * e_y) <= (length + near) * length:
+                beside = abs(m_x * e_y - m_y * e_x) <= near * half
+                if beside and abs(m_x * e_x + m_y * e_y) <= (half + near) * half:
                     best = _squared(wall, n_vertices, i, m_x, m_y, best, work, bits)
                 i = i + _U(1) if side == 0 else i - _U(1)
         distance[row] = _F(math.sqrt(best))

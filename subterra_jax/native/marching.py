@@ -8,6 +8,7 @@ from numba import njit
 from subterra_jax.lidar3d.cells import FACES, MARGIN, N_FACES, N_WEDGES, NEAR_UNIT, X_BITS
 from subterra_jax.lidar3d.meeting import FINE, PAST, SEAM
 from subterra_jax.lidar3d.relief import N_FRAME, N_LINK
+from subterra_jax.native.frames import argument, result
 from subterra_jax.native.gathers import load_corners, load_rows
 from subterra_jax.native.lanes import (
     N_HALF,
@@ -257,29 +258,24 @@ def march_block(frame, f, link, here, cell, entry, vertex, n_x, px, py, pz, dx, 
 
 @compiled
 @no_type_check
-def march_rows(
-    begin, end, origin, direction, block, limit, frame, link, cell, entry, vertex, box, n_x, distance, found, home
-):
-    """March the rays `begin` to `end`; all arrays are flat, and as `march.march` has them.
+def _ints(call, i):
+    return argument(call, i).view(_I)
 
-    Args:
-        begin: First ray to march.
-        end: One after the last.
-        origin: Origins, m.
-        direction: Unit vectors.
-        block: Blocks around the origins.
-        limit: Largest distances of interest, m.
-        frame: Of the relief, as the next five.
-        link: See `Relief`.
-        cell: See `Relief`.
-        entry: See `Relief`.
-        vertex: See `Relief`.
-        box: See `Relief`.
-        n_x: Cells of a block along the axis.
-        distance: Output, distances to the first triangle, m; `inf` where there is none.
-        found: Output, entries of these triangles; -1 where there is none.
-        home: Output, blocks of these entries.
-    """
+
+@njit(error_model="numpy", fastmath={"contract"})
+@no_type_check
+def march_rows(call, begin, end):
+    """March the rays `begin` to `end` of a call: origin, direction, block, limit, a relief's arrays, n_x to `Hits`."""
+    origin, direction, block, limit = argument(call, 0), argument(call, 1), _ints(call, 2), argument(call, 3)
+    frame, link, cell, entry, vertex = (
+        argument(call, 4),
+        _ints(call, 5),
+        _ints(call, 6),
+        _ints(call, 7),
+        _ints(call, 8),
+    )
+    box, n_x = argument(call, 9), _ints(call, 10)[0]
+    distance, found, home = result(call, 0), result(call, 1).view(_I), result(call, 2).view(_I)
     for ray in range(begin, end):
         here, reached, hit, which, at_home = np.int64(block[ray]), _ZERO, _FAR, -1, np.int64(block[ray])
         farthest = limit[ray]

@@ -10,7 +10,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from subterra_jax.lidar3d import beams, echo
-from subterra_jax.lidar3d.casting import Met, meet, require_free
+from subterra_jax.lidar3d.casting import Met, meet, require_free, require_pattern
 from subterra_jax.lidar3d.echo import EchoParams
 from subterra_jax.lidar3d.relief import Relief
 from subterra_jax.lidar3d.space import Mount, into_tunnel, stand
@@ -70,7 +70,8 @@ def make_sensor(sensor: Any, **changes: Any) -> SpatialParams:
         ValueError: There is no such sensor or field, or the beams are none.
     """
     if not isinstance(sensor, str):
-        made = SpatialParams(_checked(sensor), jnp.zeros(len(sensor)), 30.0, shape=(1, len(sensor)))
+        require_pattern(rays := np.asarray(sensor, np.float32), (2,))
+        made = SpatialParams(jnp.asarray(rays), jnp.zeros(len(rays)), 30.0, shape=(1, len(rays)))
     elif sensor not in _MADE:
         raise ValueError(f"no sensor {sensor!r}; there are {', '.join(SENSORS)}, and unit vectors (n, 3)")
     else:
@@ -79,25 +80,6 @@ def make_sensor(sensor: Any, **changes: Any) -> SpatialParams:
     if unknown := set(changes) - known:
         raise ValueError(f"a sensor has no {sorted(unknown)}; there are {sorted(known)}")
     return dataclasses.replace(made, **changes)
-
-
-def _checked(directions: Any) -> Array:
-    """Return beams as an array of unit vectors.
-
-    Raises:
-        ValueError: There is no beam, or one is no number or no unit vector.
-    """
-    array = np.asarray(directions, np.float64)
-    if array.ndim != 2 or array.shape[1] != 3 or not len(array):
-        raise ValueError(f"a pattern needs one or more beams as unit vectors (n, 3), got shape {array.shape}")
-    size = np.linalg.norm(array, axis=1)
-    if not np.all(np.isfinite(size)):
-        raise ValueError(f"beam {int(np.argmin(np.isfinite(size)))} of the pattern is no number")
-    if np.any(off := np.abs(size - 1.0) > 1e-3):
-        raise ValueError(
-            f"beam {int(np.argmax(off))} of the pattern is no unit vector: its length is {size[off][0]:.4g}"
-        )
-    return jnp.asarray(array, jnp.float32)
 
 
 def _spinning(

@@ -8,11 +8,10 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from subterra_jax import constants, native
-from subterra_jax.lidar import gpu, nvidia
+from subterra_jax import constants
+from subterra_jax.lidar import gpu, kernels
 from subterra_jax.parts.part import Drive, Motion, Moved
 from subterra_jax.rows import rowwise, slope_along, vary_like
 from subterra_jax.state import EnvParams, State
@@ -91,8 +90,7 @@ def clearance(tunnel: Tunnel, position: Float[Array, "2"], station: Float[Array,
     """
     node = node_at(tunnel, station)
     # The kernels know 32 bits.
-    by_kernel = (native.supported() or nvidia.present()) and position.dtype == jnp.float32
-    by_kernel = by_kernel and tunnel.packed is not None
+    by_kernel = kernels.present() and position.dtype == jnp.float32 and tunnel.packed is not None
     return _measured_gap(by_kernel, tunnel.walls, position, node)
 
 
@@ -116,24 +114,14 @@ def _nearest_points(
     return x0 + share * edge_x, y0 + share * edge_y
 
 
-def _gap_rows(tunnel: Tunnel, position: Float[Array, "n 2"], node: Int[Array, " n"]) -> Float[Array, " n"]:
-    """Compute `clearance` of many points in one tunnel."""
-    kernels = {}
-    if nvidia.present():
-        kernels["cuda"] = _by(gpu.clearance)
-    if native.supported():
-        from subterra_jax.native import calls  # numba is optional
-
-        kernels["cpu"] = _by(calls.clearance)
-    by_xla: Callable[..., Array] = jax.vmap(_gap, in_axes=(None, 0, 0))
-    return lax.platform_dependent(tunnel, position, node, **kernels, default=by_xla)
-
-
 def _by(kernel: Callable[..., Array]) -> Callable[..., Array]:
     """A kernel whose distances vary like the points."""
     return lambda tunnel, position, node: vary_like(kernel(tunnel, position, tunnel.visit_first[node]), position, node)
 
 
+_gap_rows = kernels.fastest(
+    jax.vmap(_gap, in_axes=(None, 0, 0)), _by(gpu.clearance), _by(kernels.compiled_by_numba("clearance"))
+)
 _gap_by_kernel = rowwise(_gap, _gap_rows)
 
 

@@ -10,6 +10,7 @@ import pytest
 
 import subterra_jax as st
 from subterra_jax import lidar, lidar3d, native
+from subterra_jax.lidar import nvidia
 from subterra_jax.lidar3d import beams, casting, finding, fused, march, relay
 from subterra_jax.lidar3d.relief import Relief, stack_reliefs
 from subterra_jax.lidar3d.surface import BOX_CORNERS, BOX_FACES, Axis, Triangles
@@ -57,8 +58,6 @@ def reliefs(bend):
     round_tube = surfaces.tube(axis, RADIUS, 360, 31)
     things = (surfaces.box((20.0, 0.5, -1.0), (0.25, 0.2, 0.3)), surfaces.box((35.0, 0.0, 0.0), (0.02, 0.02, 1.9)))
     made = [relief_of(axis, round_tube), relief_of(axis, surfaces.together(round_tube, *things)), relief_of(*bend)]
-    for _ in range(2):
-        made = [one.pad_to(other) for one in made for other in [max(made, key=lambda r: r.n_bytes)]]
     sizes = made[0]
     for other in made[1:]:
         sizes = sizes.pad_to(other)
@@ -182,30 +181,26 @@ def found_by(find, relief, origin, way, station):
 @pytest.mark.parametrize("name", [pytest.param("bend", marks=pytest.mark.slow), "things"])
 def test_the_fused_kernel_and_xla_meet_the_same_triangles(bend, reliefs, name):
     rays = bend_rays(bend[0] if name == "bend" else surfaces.axis_of(LENGTH), 72, 4)
-    finds = (finding.facing_in_step, fused.find_facing)
+    finds = (finding.by_xla, fused.find)
     (xla, xla_normal), (kernel, normal) = (found_by(find, reliefs[name], *rays) for find in finds)
     np.testing.assert_array_equal(xla.entry, kernel.entry)
     np.testing.assert_allclose(xla.distance, kernel.distance, rtol=1e-6)
     np.testing.assert_allclose(xla_normal, normal, atol=1e-6)
-    for one, other in zip(found_by(fused.find, reliefs[name], *rays), kernel, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-6)
 
 
 def test_scans_of_one_place_meet_what_rays_of_a_place_each_meet(reliefs):
     origin, way, station = bend_rays(surfaces.axis_of(LENGTH), 96, 5)
     origin, station, relief = origin[::32], station[::32], reliefs["things"]
     block, limit = jax.vmap(casting.block_at, (None, 0, 0))(relief, origin, station), jnp.full(3, 30.0)
-    hits, normal = fused.find_facing_from(
-        relief, jnp.asarray(origin), jnp.asarray(way).reshape(3, 4, 8, 3), block, limit
-    )
-    each, own = found_by(fused.find_facing, relief, np.repeat(origin, 32, 0), way, np.repeat(station, 32))
+    hits, normal = fused.find(relief, jnp.asarray(origin), jnp.asarray(way).reshape(3, 4, 8, 3), block, limit)
+    each, own = found_by(fused.find, relief, np.repeat(origin, 32, 0), way, np.repeat(station, 32))
     for one, other in zip((*hits, *normal), (*each, *own), strict=True):
         np.testing.assert_allclose(np.ravel(one), other, rtol=1e-6, atol=1e-6)
 
 
 def test_the_kernel_for_scans_lowers_for_a_gpu_and_serves_a_batch(reliefs, monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    monkeypatch.setattr(fused, "supported", lambda: True)
+    monkeypatch.setattr(nvidia, "present", lambda: True)
     monkeypatch.setattr(finding, "device_memory", lambda: None)
 
     def ranges(relief, origin, way, station):
@@ -220,7 +215,7 @@ def test_the_kernel_for_scans_lowers_for_a_gpu_and_serves_a_batch(reliefs, monke
     assert for_nvidia(ranges, reliefs["things"], *rows).count("triton") == 1
 
 
-@pytest.mark.parametrize("find", [finding.facing_in_step, fused.find_facing])
+@pytest.mark.parametrize("find", [finding.by_xla, fused.find])
 def test_normals_are_those_of_the_faces_of_a_box_and_of_the_tube_behind_it(find):
     axis, middle = surfaces.axis_of(LENGTH), np.float32([20.0, 0.5, -1.0])
     box = middle + BOX_CORNERS * [0.25, 0.2, 0.3], BOX_FACES
@@ -241,10 +236,8 @@ def test_normals_are_those_of_the_faces_of_a_box_and_of_the_tube_behind_it(find)
 @pytest.mark.skipif(not native.supported(), reason="needs numba")
 @pytest.mark.parametrize("name", ["bend", "things"])
 def test_machine_code_and_xla_give_the_same_ranges(bend, reliefs, name):
-    from subterra_jax.native import marchcall
-
     rays = bend_rays(bend[0] if name == "bend" else surfaces.axis_of(LENGTH), 600, 5)
-    xla, code = (found_by(find, reliefs[name], *rays) for find in (finding.find_in_step, marchcall.find))
+    (xla, _), (code, _) = (found_by(find, reliefs[name], *rays) for find in (finding.by_xla, finding.by_numba))
     np.testing.assert_allclose(np.minimum(xla.distance, 30.0), np.minimum(code.distance, 30.0), atol=2e-5)
     triangle = np.asarray(reliefs[name].entry)
     # A ray may meet one triangle in the list of either of two cells.
@@ -259,7 +252,7 @@ def test_rays_that_take_each_others_places_meet_what_they_meet_in_step(bend, rel
 
     whole = found_by(in_step, reliefs["bend"], *rays)
     monkeypatch.setattr(relay, "N_PLACES", 9)
-    relayed = found_by(finding.find_in_step, reliefs["bend"], *rays)
+    relayed, _ = found_by(finding.by_xla, reliefs["bend"], *rays)
     np.testing.assert_array_equal(whole.entry, relayed.entry)
     np.testing.assert_allclose(whole.distance, relayed.distance, rtol=1e-6)
 

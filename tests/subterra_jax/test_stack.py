@@ -10,7 +10,7 @@ import pytest
 import subterra_jax as st
 from benchmarks.rays import planar as reference
 from subterra_jax import lidar
-from subterra_jax.lidar import gpu, planar
+from subterra_jax.lidar import gpu, kernels, planar
 from subterra_jax.parts import unicycle as vehicle
 from subterra_jax.tunnel import Tunnel, foot, node_at
 from subterra_jax.tunnel.tunnel import stack
@@ -137,7 +137,7 @@ def test_a_batch_of_different_tunnels_and_lidars_goes_to_the_kernels_as_rows(pla
 
     by_xla, kernel, calls = scans(), planar._cast_rows, []
     monkeypatch.setattr(planar, "_cast_rows", lambda *args: calls.append(args) or kernel(*args))
-    monkeypatch.setattr(planar, "skips_unwanted", lambda params: True)
+    monkeypatch.setattr(kernels, "present", lambda: True)
     np.testing.assert_allclose(scans(), by_xla, atol=1e-5)
     assert [call[1].shape for call in calls] == [(8, 2)]
 
