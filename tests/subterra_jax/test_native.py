@@ -174,6 +174,7 @@ print(float(st.AutoReset(env).reset(jax.random.key(0), params, 512)[0].sum()))
 """
     march = """
 import jax.numpy as jnp
+import subterra_jax as st
 from subterra_jax import lidar3d
 plan = st.load_tunnel("open:straight:val:4").slice(20.0, 60.0)
 relief = lidar3d.Relief.from_plan(plan)
