@@ -26,7 +26,7 @@ class Score:
     """Success of an agent in one column, or over several."""
 
     success: float  # Share of the episodes, 0 to 1
-    low: float  # Lower end of its 95 % interval, by a bootstrap within tunnels
+    low: float  # Lower end of its 95 % interval, by a bootstrap of seeds within tunnels
     high: float  # Upper end
     contact: float  # Share of the episodes that end at a wall or a box
     median_error: float | None  # Median distance from the goal at the stop, m; None where nobody stopped
@@ -82,31 +82,34 @@ def keys_of(cells: Cells) -> list[Key]:
     return list(dict.fromkeys((column["split"], column["kind"]) for cell in widest for column in cell["columns"]))
 
 
-def summarise(cell: Cell, chosen: Collection[Key] | None = None) -> Score | None:
-    """Sum up the columns of a cell that are chosen, each counted alike.
+def summarise(cell: Cell, chosen: Collection[Key]) -> Score | None:
+    """Sum up columns of one split, each counted alike.
+
+    The kinds of a split share their seeds, and who never looks at the walls does the same in each of them: an interval
+    over kinds is of the seeds, not of all episodes.
 
     Args:
         cell: The cell.
-        chosen: Split and kind of the columns; all if None.
+        chosen: Split and kind of the columns.
 
     Returns:
         The score; None where the cell has none of these columns.
     """
     size = len(cell["success"]) // len(cell["columns"])
-    rows, groups, floors, first = [], [], [], 0
+    rows, group, floors, first = [], np.zeros(size, int), [], 0
     for place, column in enumerate(cell["columns"]):
         tunnels = tunnels_in(column["split"], cell["tunnels"])
-        if chosen is None or (column["split"], column["kind"]) in chosen:
+        if (column["split"], column["kind"]) in chosen:
             rows.append(np.arange(place * size, (place + 1) * size))
-            groups.append(first + np.arange(size) % tunnels)
+            group = np.arange(size) % tunnels
             floors += [] if cell["floor"] is None else [np.mean(cell["floor"][first : first + tunnels])]
         first += tunnels
     if not rows:
         return None
-    row, group = np.concatenate(rows), np.concatenate(groups)
+    row = np.concatenate(rows)
     success, contact = (np.array(cell[name], float)[row] for name in ("success", "contact"))
     error = np.array([np.nan if e is None else e for e in cell["goal_error"]], float)[row]
-    low, high = _ends(success.tobytes(), group.tobytes())
+    low, high = _ends(success.reshape(len(rows), size).mean(axis=0).tobytes(), group.tobytes())
     stopped = np.abs(error[~np.isnan(error) & (contact == 0.0)])
     return Score(
         success=float(success.mean()),
@@ -121,7 +124,7 @@ def summarise(cell: Cell, chosen: Collection[Key] | None = None) -> Score | None
 
 @functools.cache  # tables, picture, leaks and records ask for the same ones
 def _ends(success: bytes, group: bytes) -> tuple[float, float]:
-    """Return the 95 % interval of shares within groups, given as the bytes of float64 and int64 arrays."""
+    """Return the 95 % interval of a mean within groups, given as the bytes of float64 and int64 arrays."""
     rows = grouped(np.frombuffer(success), np.frombuffer(group, np.int64))
     return interval(rows, lambda drawn: drawn.mean(axis=(-2, -1)))
 

@@ -135,6 +135,16 @@ def test_a_cell_of_some_of_the_splits_stands_where_it_was_driven():
     assert above == ["ring-filter, StopAt, cast of test-unseen: 100 % is above the ceiling, 0 %"]
 
 
+def test_who_does_the_same_in_every_kind_has_the_interval_of_one_kind():
+    blind = cell("fused", 0.5, splits=("val", "val"))
+    blind["columns"][1] = {"kind": "rock", "split": "val"}
+    one, both = (cells.summarise(blind, keys) for keys in ({("val", "cast")}, {("val", "cast"), ("val", "rock")}))
+    assert (both.low, both.high, both.n) == (one.low, one.high, 2 * one.n)
+    half = len(blind["success"]) // 2
+    blind["success"][half:] = [1 - value for value in blind["success"][half:]]
+    assert cells.summarise(blind, {("val", "cast"), ("val", "rock")}).high == 0.5
+
+
 def test_columns_of_different_numbers_of_tunnels_are_summed_up_by_their_own():
     mixed = cell("fused", 0.5, splits=SPLITS)
     mixed["columns"][1] = {"kind": "mine", "split": OWN}
