@@ -65,6 +65,7 @@ def test_a_frame_where_nothing_was_recorded_is_one_sentence(recorded, tmp_path):
 
 def write_run(folder, coverage):
     folder.mkdir(parents=True)
+    (folder / "log.jsonl").touch()
     (folder / "config.json").write_text(json.dumps({"task": "Subterra/TraverseShort-v1"}))
     rows = [f"{k + 1},{10 * (k + 1)},{value:.9g},{int(value >= 0.9)},10,0" for k, value in enumerate(coverage)]
     (folder / "episodes.csv").write_text("\n".join(["episode,step,coverage,success,length,contact", *rows]) + "\n")
