@@ -165,9 +165,9 @@ def find_leaks(cells: Cells) -> list[str]:
                 continue
             for (split, kind), score in of_agent.items():
                 where = f"{agent}, {setting.words}, {kind} of {split}: {100 * score.success:.0f} % is above"
-                blind = entry_of(agent).group == "blind" and score.floor is not None
-                if blind and is_above(score.success, score.floor, score.n, 0):  # type: ignore[arg-type]
-                    found.append(f"{where} the floor, {100 * score.floor:.0f} %")  # type: ignore[operator]
+                floor = score.floor if entry_of(agent).group == "blind" else None
+                if floor is not None and is_above(score.success, floor, score.n, 0):
+                    found.append(f"{where} the floor, {100 * floor:.0f} %")
                 top = scores.get(CEILING, {}).get((split, kind))
                 if top is not None and is_above(score.success, top.success, score.n, top.n):
                     found.append(f"{where} the ceiling, {100 * top.success:.0f} %")

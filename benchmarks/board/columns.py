@@ -26,7 +26,7 @@ class Column:
 
 @dataclasses.dataclass(frozen=True)
 class Setting:
-    """What is driven."""
+    """A task, and whether its start is hidden."""
 
     task: str  # A task of the benchmark without `Subterra/` and version, or the id of one's own
     hidden_start: bool = False  # Whether the start that is given is wrong by an unknown amount

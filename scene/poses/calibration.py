@@ -18,7 +18,7 @@ _ORTHONORMAL = 1e-3  # published matrices are rounded to 6 digits
 class Mount:
     """Transform from LiDAR coordinates to an instrument's: `p_instrument = rotation @ p_lidar + shift`."""
 
-    rotation: Float[np.ndarray, "3 3"]  # `(3, 3)`
+    rotation: Float[np.ndarray, "3 3"]
     shift: Float[np.ndarray, "3"]  # m
 
     @property

@@ -112,7 +112,7 @@ def _correlate(one: np.ndarray, other: np.ndarray) -> float:
 
 @dataclass(frozen=True)
 class Clock:
-    """What the turns tell of another clock."""
+    """The offset of another clock, as the turns tell it."""
 
     of: str  # Whose clock: a topic, or the trajectory
     offset: float | None  # By which it is later than the LiDAR's, s; `None` where the turns do not tell

@@ -32,7 +32,7 @@ _FLAG = tyro.conf.arg(prefix_name=False)
 
 @dataclass(frozen=True)
 class TimeConfig:
-    """What the user says of the times of points; nothing overrules it."""
+    """The user's word on the times of points; nothing overrules it."""
 
     # Unit of the times of points: s, ms, us or ns; none leaves them out, and every sweep is static.
     time_unit: Annotated[Literal["s", "ms", "us", "ns", "none"] | None, _FLAG] = None
@@ -157,7 +157,7 @@ def _unwrap(values: Shaped[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], 
 
 @dataclass
 class Spans:
-    """What the headers and times of all sweeps say, gathered sweep by sweep."""
+    """Headers and times of all sweeps, gathered sweep by sweep."""
 
     name: str = ""
     unit: str | None = None

@@ -26,7 +26,7 @@ from scene.survey.section import draw_field
 class Mount:
     """Transform between two instruments: p_instrument = rotation @ p_other + shift."""
 
-    rotation: Float[np.ndarray, "3 3"]  # `(3, 3)`
+    rotation: Float[np.ndarray, "3 3"]
     shift: Float[np.ndarray, "3"]  # m
 
     @property

@@ -1,4 +1,4 @@
-"""How the numbers of a `tunnel.npz` are written: whole units, as differences. docs/formats.md has the fields."""
+"""Numbers of a `tunnel.npz`, written in whole units, as differences. docs/formats.md has the fields."""
 
 from collections.abc import Mapping
 from pathlib import Path

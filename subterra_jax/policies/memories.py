@@ -1,4 +1,4 @@
-"""What a policy keeps between observations beside the network's own memory: reckoning, a stack, a localiser.
+"""Memories of a policy beside the network's own: reckoning, a stack, a localiser.
 
 The station that the inputs show as a way to go is dead-reckoned; with `along` it is the learnt localiser's, with `map`
 that of a histogram filter on the map. All functions take one robot; training and driving call the same ones.
@@ -38,7 +38,7 @@ class Located:
 
 @struct.dataclass
 class Kept:
-    """What is kept between two observations."""
+    """The memory between two observations."""
 
     reckoned: Reckoned  # dead reckoning
     stack: Float[Array, "earlier n"]  # inputs of earlier observations, oldest first; none without a stack
@@ -159,7 +159,7 @@ class Memory:
 
 @struct.dataclass
 class Given:
-    """What a memory is made with."""
+    """The ingredients of a memory."""
 
     weights: Any = None  # of the learnt localiser, as `locate.memory.init` makes them; None without one
     # the map as the learnt localiser takes it, or a filter on it in its place; None has none

@@ -1,4 +1,4 @@
-"""What the recorder makes of an episode: poses in three dimensions, and further sensors along them.
+"""Messages that the recorder makes of an episode: poses in three dimensions, and further sensors along them.
 
 Frames as in REP 105: `map` is the tunnel frame, `base_link` stands on the track under the LiDARs, x ahead, y to the
 left, z square to the track; `odom` is `base_link` at the start. Both LiDARs and the IMU sit at LiDAR height above it.

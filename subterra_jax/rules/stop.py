@@ -93,7 +93,7 @@ class StopState(GoalState):
 
 
 class GoalRule(Rule):
-    """What the rules that end with a stop share."""
+    """The base of the rules that end with a stop."""
 
     streams: ClassVar[tuple[int, ...]] = (0, 4, 5)
 
