@@ -12,7 +12,7 @@ from typing import Any
 
 from benchmarks.command import run_main, run_module
 from benchmarks.report import write_report
-from benchmarks.truth import Truth, compare, load_truth, start_placement
+from benchmarks.truth import compare, load_truth
 from scene.survey.config import SurveyConfig, check_survey
 from subterra_jax.host.files import require_folder
 from subterra_jax.pictures.renderer import import_mujoco
@@ -81,30 +81,30 @@ def main(config: DemoConfig) -> None:
     """
     out, started, seconds = config.out, time.monotonic(), dict[str, float]()
     require_folder(out)
-    survey, scene, blind, run = (out / name for name in ("survey", "scene", "scene-odometry", "training"))
+    survey, scene, run = (out / name for name in ("survey", "scene", "training"))
     check_survey(SurveyConfig(survey, length=config.length, seed=config.seed, point_rate=config.point_rate))
     bag, seed = survey / "survey.bag", ("--seed", config.seed)
-    simulated = ("--provenance", "simulated", "--out")
+    task = ("--task", TASK, "--tunnel", scene / "tunnel.npz")
     with timed(seconds, "survey", f"1/6 Simulating a survey of {config.length:g} m (a ROS1 bag in GEODE's layout)"):
         size = ("--length", config.length, "--point-rate", config.point_rate)
         _run("scene.survey", *size, *seed, "--out", survey)
     with timed(seconds, "build", "2/6 Reconstructing the bore from the bag, poses given"):
-        _run("scene.build", bag, "--trajectory", survey / "groundtruth.tum", *simulated, scene)
-    with timed(seconds, "build_odometry", "3/6 The same without poses: LiDAR odometry alone"):
-        failure = run_module("scene.build", bag, *simulated, blind, log=out / "build-odometry.txt").message
-        print(failure)
-    with timed(seconds, "load", "4/6 Loading the scene into MuJoCo and MJX"):
+        poses = ("--trajectory", survey / "groundtruth.tum")
+        _run("scene.build", bag, *poses, "--provenance", "simulated", "--out", scene)
+    with timed(seconds, "load", "3/6 Loading the scene into MuJoCo and MJX"):
         loaded = step_in_mujoco_and_mjx(scene)
         print(", ".join(f"{name} {value}" for name, value in loaded.items()))
-    with timed(seconds, "train", f"5/6 Training on the reconstructed bore ({TASK})"):
-        _run("train", "--task", TASK, "--tunnel", scene / "tunnel.npz", *seed, "--overwrite", "--out", run)
+    with timed(seconds, "train", f"4/6 Training on the reconstructed bore ({TASK})"):
+        _run("train", *task, *seed, "--overwrite", "--out", run)
+    with timed(seconds, "film", "5/6 Filming what was learnt"):
+        _run("benchmarks.draw", "film", *task, "--agent", run, "--pictures", 60, "--out", out / "film.webp")
     with timed(seconds, "report", "6/6 Writing the report"):
         truth = load_truth(survey / "truth.json")
         summary: dict[str, Any] = {
             "provenance": "simulated",
+            "task": TASK,
             "length": float(truth.station[-1] - truth.station[0]),
             **compare(scene, truth).figures(),
-            "odometry": _odometry_figures(survey, blind, truth, failure),
             **_training_figures(run),
             **loaded,
             "stage_seconds": seconds,
@@ -126,13 +126,6 @@ def _training_figures(run: Path) -> dict[str, Any]:
         "train_episodes": last["episodes"],
         **{f"evaluation_{name}": evaluation[name] for name in ("episodes", "coverage", "success", "offset", "time")},
     }
-
-
-def _odometry_figures(survey: Path, scene: Path, truth: Truth, failure: str) -> dict[str, Any]:
-    if failure:
-        return {"failure": failure}
-    placement = start_placement(scene / "odometry.tum", survey / "groundtruth.tum")
-    return dict(compare(scene, truth, placement).figures())
 
 
 if __name__ == "__main__":

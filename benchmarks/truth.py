@@ -9,7 +9,6 @@ import trimesh
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation, Slerp
 
 SCHEMA = "subterra.truth/1"
 _FINE = 0.01  # m between points where the nearest one is looked up
@@ -55,35 +54,11 @@ def load_truth(path: Path) -> Truth:
     return Truth(*(np.asarray(data[name], float) for name in ("station", "position", "width", "height")))
 
 
-@dataclass(frozen=True)
-class Placement:
-    """A rigid motion from the frame of a scene's input into that of the truth: `rotation @ x + shift`."""
-
-    rotation: Float[np.ndarray, "3 3"]
-    shift: Float[np.ndarray, "3"]
-
-
-SAME_FRAME = Placement(np.eye(3), np.zeros(3))
-
-
-def start_placement(estimated: Path, true: Path) -> Placement:
-    """Returns the motion that puts an estimate's first pose on the true pose of that time; nothing else is fitted.
-
-    Args:
-        estimated: TUM file of the estimate.
-        true: TUM file of the truth, covering the estimate's first row.
-    """
-    first, truth = np.loadtxt(estimated)[0], np.loadtxt(true)
-    position = np.array([np.interp(first[0], truth[:, 0], column) for column in truth[:, 1:4].T])
-    turn = Slerp(truth[:, 0], Rotation.from_quat(truth[:, 4:]))(first[0]) * Rotation.from_quat(first[4:]).inv()
-    return Placement(turn.as_matrix(), position - turn.apply(first[1:4]))
-
-
-def centreline(scene: Path, placement: Placement = SAME_FRAME) -> tuple[np.ndarray, np.ndarray]:
-    """Returns stations (m, `(n,)`) and positions (m, `(n, 3)`) of a scene's bore in the frame of the truth."""
+def centreline(scene: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Returns stations (m, `(n,)`) and positions (m, `(n, 3)`) of a scene's bore in the frame of its survey."""
     with np.load(scene / "bore.npz") as bore:
         origin = np.asarray(json.loads((scene / "manifest.json").read_text())["frame"]["origin"])
-        return bore["station"], (bore["position"] + origin) @ placement.rotation.T + placement.shift
+        return bore["station"], bore["position"] + origin
 
 
 def scene_points(scene: Path) -> Float[np.ndarray, "p 3"]:
@@ -93,15 +68,14 @@ def scene_points(scene: Path) -> Float[np.ndarray, "p 3"]:
     return np.asarray(cloud.vertices)
 
 
-def compare(scene: Path, truth: Truth, placement: Placement = SAME_FRAME) -> Comparison:
+def compare(scene: Path, truth: Truth) -> Comparison:
     """Compares a scene's bore with the truth: each true section with the nearest point of the reconstruction.
 
     Args:
         scene: Folder with `bore.npz` and `manifest.json`.
         truth: Truth of the survey.
-        placement: Motion from the frame of the scene's input into that of the truth.
     """
-    station, position = centreline(scene, placement)
+    station, position = centreline(scene)
     with np.load(scene / "bore.npz") as bore:
         size = {name: CubicSpline(station, bore[name]) for name in ("width", "height")}
     curve = CubicSpline(station, position)

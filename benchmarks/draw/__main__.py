@@ -1,6 +1,6 @@
-"""Draws kinds of lining, an atlas of a tunnel, a scene, or the paper's figures.
+"""Draws kinds of lining, an atlas of a tunnel, a scene, the paper's figures, or the film of an episode.
 
-`python -m benchmarks.draw kinds --out out/kinds`; likewise `atlas`, `scene` and `paper`.
+`python -m benchmarks.draw kinds --out out/kinds`; likewise `atlas`, `scene`, `paper` and `film`.
 `--help` after one of them says more.
 """
 
@@ -9,7 +9,7 @@ from importlib import import_module
 
 from subterra_jax.pictures.renderer import choose_gl
 
-COMMANDS = ("kinds", "atlas", "scene", "paper")
+COMMANDS = ("kinds", "atlas", "scene", "paper", "film")
 
 
 def main(words: list[str] | None = None) -> int:
