@@ -69,7 +69,8 @@ def run(config: FilmConfig) -> None:
     require_file(config.out, ".webp")
     env, params = st.make(config.task, tunnel=config.tunnel, sensor=config.sensor)
     agent = policies.open_agent(config.agent, env, params)
-    recording = drive_whole(env, params, agent, config.seed, str(config.tunnel or ""), Path(config.agent).name)
+    name = "a trained policy" if Path(config.agent).exists() else config.agent
+    recording = drive_whole(env, params, agent, config.seed, str(config.tunnel or ""), name)
     write_file(config.out, film(params, recording, config.pictures))
     outcome = "success" if recording.success else "contact" if recording.contact else "no success"
     print(f"{config.out}: {recording.duration:.0f} s of driving, {outcome}")
