@@ -12,7 +12,7 @@ from subterra_jax.host.versions import VERSION
 # Name: module that it runs, and its meaning. The modules outside this package come with a checkout.
 COMMANDS = {
     "tasks": ("", "list the tasks"),
-    "view": ("subterra_jax.viewer", "watch a task and drive it in the browser"),
+    "view": ("subterra_jax.viewer", "drive an episode and write it as a page for the browser"),
     "record": ("subterra_jax.recorder", "write an episode as MCAP with ROS 2 messages"),
     "train": ("train", "train a policy by PPO"),
     "board": ("benchmarks.board", "drive agents on the benchmark"),

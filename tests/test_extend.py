@@ -133,18 +133,14 @@ def test_a_task_from_outside_works_with_gymnasium_and_stable_baselines(desk):
 
 
 @pytest.mark.slow
-def test_board_recorder_and_viewer_take_a_task_from_outside(desk, capsys):
+def test_board_and_recorder_take_a_task_from_outside(desk, capsys):
     from benchmarks.board.__main__ import main as board
     from subterra_jax.recorder.__main__ import main as recorder
-    from subterra_jax.viewer import library
 
     words = ["--tasks", TASK, "--agents", "dead-reckoning", "--episodes", "2", "--out", "board"]
     assert board([*words, "--splits", "--further", "subterra-351"]) == 0
     assert "KeepLeft" in (desk / "board" / "board.md").read_text()
     assert recorder(["--task", TASK, "--agent", "dead-reckoning", "--steps", "20", "--out", "episode"]) == 0
-    plan = st.load_tunnel().slice(0.0, 60.0)
-    *_, episode = library.drive_episode(plan, "0", "t", "smooth", "Mine/KeepLeft-v1", "dead-reckoning", 0)
-    assert episode.coverage[-1] >= 0.9
 
 
 HURRY = """

@@ -158,8 +158,8 @@ MISTAKES = {
     "subterra_jax.viewer --sensor radar": "no sensor 'radar'; there are planar16",
     "subterra_jax.viewer --moon": "unrecognized arguments: --moon",
     "subterra_jax.viewer --task Subterra/StopAt-v7": "its id is Subterra/StopAt-v1",
-    "subterra_jax.viewer --recordings /proc/no/x": "/proc/no/x: cannot be written",
-    "subterra_jax.viewer --replay junk.npz": "junk.npz: not a readable recording",
+    "subterra_jax.viewer --out /proc/no/x.html": "/proc/no: cannot be written",
+    "subterra_jax.viewer --tunnel junk.npz": "junk.npz: ",
     "subterra_jax.recorder": "missing: --out",
     "subterra_jax.recorder --out o --task Subterra/StopAt-v7": "its id is Subterra/StopAt-v1",
     "subterra_jax.recorder --out o --policy junk.safetensors": "damaged policy",
@@ -190,7 +190,6 @@ def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for name in ("scene.xml", "bore.npz", "tunnel.npz", "manifest.json", "meshes/lining.ply"):
         (tmp_path / "tunnel" / name).write_bytes(JUNK)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("subterra_jax.viewer.__main__._compile_once", lambda: None)
     return tmp_path
 
 

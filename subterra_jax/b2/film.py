@@ -31,8 +31,8 @@ def film(env: B2Env, agent: Agent, seconds: float, seed: int = 0) -> list[np.nda
     """
     steps = max(round(seconds / float(env.task_params.vehicle.period)), 1)
     with jax.default_device(first_cpu()):
-        start, *_, trace = drive(env.task_env, env.task_params, agent, seed, steps=steps)
-    poses = trace.pose[len(start.pose) :].reshape(-1, N_POSE)
+        trace = drive(env.task_env, env.task_params, agent, seed, steps=steps)
+    poses = trace.pose[1:].reshape(-1, N_POSE)
     return [env.camera.draw(pose) for pose in poses[::_EVERY]]
 
 

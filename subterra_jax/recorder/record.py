@@ -202,7 +202,7 @@ def record(config: RecorderConfig) -> Trace:
     agent = open_agent(config, world)
     relief = None if config.cloud == "none" else Relief.from_scene(config.scene or "", config.lining or "pockets")
     seed, severity = draw_episode(config, world)
-    *_, trace = drive(world.env, world.params, agent, seed, severity, config.steps)
+    trace = drive(world.env, world.params, agent, seed, severity, config.steps)
     with ExitStack() as stack:
         recording, truth = (stack.enter_context(_new_folder(f)) for f in (config.recording_folder, config.truth_folder))
         _write_recording(recording, config, trace, world, relief, seed)

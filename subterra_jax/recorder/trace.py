@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -23,7 +22,7 @@ N_POSE = 19  # position, quaternion and joints of a robot on legs
 
 @dataclasses.dataclass(frozen=True)
 class Trace:
-    """An episode of `n` steps so far, on the host; row k is the moment after k periods, from 0 to n."""
+    """An episode of `n` steps, on the host; row k is the moment after k periods, from 0 to n."""
 
     state: State  # states, each leaf with a leading axis of `n + 1`
     observation: Float[np.ndarray, "rows n_obs"]  # observations as the agent got them
@@ -58,7 +57,7 @@ class Trace:
 
 def drive(
     env: TunnelEnv, params: EnvParams, agent: Agent, seed: int, severity: int | None = None, steps: int | None = None
-) -> Iterator[Trace]:
+) -> Trace:
     """Drive to the end of the episode, the one that `evaluation.evaluate` drives for the same seed and severity.
 
     Args:
@@ -68,9 +67,6 @@ def drive(
         seed: Seed of everything random.
         severity: Severity of the faults; drawn where it is left out.
         steps: Steps at most; the task's horizon if left out.
-
-    Yields:
-        The trace so far: first the start alone, at last the whole.
     """
     env, legs = dataclasses.replace(env, estimates=True), _Legs(env)
     driver = Driver(env, keep=_keep)
@@ -81,7 +77,6 @@ def drive(
     limit = int(params.horizon) if steps is None else min(steps, int(params.horizon))
     chunk = _CHUNK if legs.physics is None else _FEW
     try:
-        yield trace
         for _, kept in driver.drive(params, agent, now, chunk, steps):
             rows: dict[str, Any]
             (after, noise), rows = jax.device_get(kept)
@@ -96,9 +91,9 @@ def drive(
             }
             state = jax.tree.map(lambda old, new, n=n: np.concatenate([old, new[:n]]), trace.state, after)
             trace = dataclasses.replace(trace, state=state, observation=np.concatenate(observed), **ends, **series)
-            yield trace
     finally:
         legs.release()
+    return trace
 
 
 def _keep(now: Episode, taken: Taken, params: EnvParams) -> tuple[Any, dict[str, Any]]:

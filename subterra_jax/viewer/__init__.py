@@ -1,5 +1,5 @@
-"""A tunnel, a robot and its belief in the browser: `python -m subterra_jax.viewer`.
+"""A driven episode as one page for the browser: `python -m subterra_jax.viewer`.
 
-plan, scene folder ─► shapes ─► scene ◄─ player ◄─ recording ◄─ driving (env + agent)
-                                  └────── session, panel, browsers ────┘
+trace (recorder.trace) ─► episode (lines and points) ─┐
+plan ─► shapes (walls, floor) ────────────────────────┴► page (viser's player in one HTML file) ◄─ chart
 """

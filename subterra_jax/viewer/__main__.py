@@ -1,84 +1,103 @@
-"""`python -m subterra_jax.viewer`: shows episodes in the browser."""
+"""`python -m subterra_jax.viewer`: drives an episode and writes it as a page for the browser."""
 
 import argparse
-import logging
 import sys
-import time
-import warnings
+import webbrowser
 from pathlib import Path
 from typing import Any
 
-from subterra_jax.host.cache import cache_folder
 from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
-from subterra_jax.viewer.config import LOOPBACK, ViewerConfig, ViewerError
+from subterra_jax.host.errors import MissingLibraryError, SubterraError
+from subterra_jax.host.files import require_file
 
-_EXAMPLE = "example: python -m subterra_jax.viewer --scene build/tunnel --task StopAt --driver particle-filter"
+_EXAMPLE = "example: python -m subterra_jax.viewer --task StopAt --driver particle-filter --out out/view.html --open"
 
 
-def parse_arguments(arguments: list[str] | None = None) -> ViewerConfig:
+def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     """Read a command line.
 
     Raises:
         SystemExit: The command line is malformed, or help was shown.
     """
     parser = argparse.ArgumentParser(
-        prog="python -m subterra_jax.viewer", description="Shows episodes in the browser.", epilog=_EXAMPLE
+        prog="python -m subterra_jax.viewer",
+        description="Drives an episode and writes it as one HTML file, which any browser plays.",
+        epilog=_EXAMPLE,
     )
     add = parser.add_argument
-    add("--scene", type=Path, metavar="DIR", help="scene folder of scene.build: its lining, track and tunnel")
-    many: dict[str, Any] = {"action": "append", "default": []}
-    add("--tunnel", dest="tunnels", metavar="NAME|FILE", help="offer another tunnel; may be repeated", **many)
-    add("--lining", metavar="NAME", help="pockets (default), smooth or furnished")
-    add("--task", metavar="ID", help="first task, as StopAt or Subterra/StopAt-v1 (the default)")
-    add("--sensor", metavar="NAME", help="planar16 (default), spin16x64, vlp16, os1-64 or avia")
-    drivers = "first driver: a baseline, policy:NAME|FILE|RUN-FOLDER, module:Class or FILE.py:Class"
-    add("--driver", dest="agent", metavar="NAME", help=drivers)
-    add("--policy", dest="policies", type=Path, metavar="FILE", help="offer this policy as driver too", **many)
-    add("--seed", type=int, metavar="N", help="seed of the first episode")
-    add("--recordings", type=Path, metavar="DIR", help="folder for saved episodes and pictures")
-    add("--replay", type=Path, metavar="FILE", help="begin with this recorded episode")
-    add("--host", metavar="ADDRESS", help="address to listen on; the default is this machine alone")
-    add("--port", type=int, metavar="N", help="first port to try")
-    given = {name: value for name, value in vars(parse(parser.parse_args, arguments)).items() if value is not None}
-    return ViewerConfig(**{**given, "tunnels": tuple(given["tunnels"]), "policies": tuple(given["policies"])})
+    add("--task", default="StopAt", metavar="ID", help="as StopAt (default), Subterra/StopAt-v1 or FILE.py:ID")
+    drivers = "a baseline (dead-reckoning is the default), policy:NAME|FILE|RUN-FOLDER, module:Class or FILE.py:Class"
+    add("--driver", default="dead-reckoning", metavar="NAME", help=drivers)
+    add("--tunnel", metavar="NAME|FILE", help="tunnel; the first of the task's own if left out")
+    add("--scene", type=Path, metavar="DIR", help="scene folder of scene.build, whose tunnel is driven")
+    add("--lining", metavar="NAME", help="pockets, smooth or furnished")
+    add("--sensor", default="planar16", metavar="NAME", help="planar16 (default), spin16x64, vlp16, os1-64 or avia")
+    add("--seed", type=int, default=0, metavar="N", help="seed of the episode")
+    add("--steps", type=int, metavar="N", help="steps at most; the task's horizon if left out")
+    add("--out", type=Path, default=Path("out/view.html"), metavar="FILE", help="page to write (out/view.html)")
+    add("--open", action="store_true", help="open it in the browser")
+    return parse(parser.parse_args, arguments)
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the viewer; return the exit status."""
-    config = parse_arguments(arguments)
-    return run_command(lambda: _serve(config), mistakes=INPUT_ERRORS)
+    """Run the command; return the exit status."""
+    settings = parse_arguments(arguments)
+    return run_command(lambda: view(settings), "interrupted: nothing was written", INPUT_ERRORS)
 
 
-def _serve(config: ViewerConfig) -> None:
-    # Malformed messages are refused silently: a traceback for each would bury the others.
-    for name in ("websockets.server", "asyncio"):
-        logging.getLogger(name).setLevel(logging.CRITICAL)
-    warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
+def view(settings: argparse.Namespace) -> None:
+    """Drive the episode of a command line and write its page.
+
+    Raises:
+        SubterraError: A file, task or driver is not available, or a value is out of range.
+    """
     try:
-        from subterra_jax.viewer.session import Viewer
-    except ModuleNotFoundError as error:
-        raise ViewerError(f"{error.name} is not installed: pip install 'subterra-jax[viewer]'") from error
-    _compile_once()
-    viewer = Viewer(config)
-    print(f"{viewer.url}  (Ctrl-C ends it)", flush=True)
-    if config.host not in (LOOPBACK, "localhost", "::1"):
-        print(
-            f"listening on {config.host}: everyone who reaches this address can drive and save in {config.recordings}"
-        )
-    try:
-        while True:
-            time.sleep(3600.0)
-    except KeyboardInterrupt:
-        viewer.stop()
+        from subterra_jax.viewer.page import write_page
+    except ModuleNotFoundError as missing:
+        raise MissingLibraryError("subterra_jax.viewer", missing.name or "viser", "viewer") from missing
+    import subterra_jax as st
+    from subterra_jax.host.task_ids import MISSIONS, WALK
+    from subterra_jax.parts.spatial_lidar import SENSORS
+    from subterra_jax.policies import open_agent
+    from subterra_jax.recorder.trace import drive
+    from subterra_jax.tasks import TASKS, find, first_tunnel, is_planar
+    from subterra_jax.tunnel.sources import tunnel_of
+    from subterra_jax.viewer.episode import draw
+    from subterra_jax.viewer.shapes import planar_shapes
 
-
-def _compile_once() -> None:
-    """Compute on the CPU, which suits one episode, and keep compiled programs on disk."""
-    import jax
-
-    jax.config.update("jax_platforms", "cpu")
-    jax.config.update("jax_compilation_cache_dir", str(cache_folder("viewer")))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+    task, sensor, out = find(settings.task, short=True), settings.sensor, require_file(settings.out, ".html")
+    if task == WALK:
+        raise SubterraError(f"{WALK} has no episode to show; {MISSIONS[0]} has")
+    if sensor not in SENSORS:
+        raise SubterraError(f"no sensor {sensor!r}; there are {', '.join(SENSORS)}")
+    if not 0 <= settings.seed < 2**32:
+        raise SubterraError(f"seed must be 0 to {2**32 - 1}, got {settings.seed}")
+    if settings.steps is not None and settings.steps < 1:
+        raise SubterraError(f"steps must be at least 1, got {settings.steps}")
+    if settings.scene is not None and settings.tunnel is not None:
+        raise SubterraError("either --scene or --tunnel, not both: a scene brings its own tunnel")
+    if settings.scene is not None and not settings.scene.exists():
+        raise SubterraError(f"{settings.scene}: no such scene folder")
+    source = settings.tunnel or first_tunnel(task, not is_planar(sensor))
+    plan = st.load_tunnel(source if settings.scene is None else tunnel_of(settings.scene), solid=not is_planar(sensor))
+    legs: dict[str, Any] = {"engine": "mujoco"} if task in MISSIONS else {}
+    env, params = st.make(task, tunnel=plan, lining=settings.lining, sensor=sensor, **legs)
+    agent = open_agent(settings.driver, env, params)
+    piece = TASKS[task].piece if task in TASKS else None
+    shown = plan if piece is None else plan.slice(piece[0], min(piece[1], plan.length - piece[0]))
+    trace = drive(env, params, agent, settings.seed, steps=settings.steps)
+    facts = {
+        "task": env.id,
+        "driver": settings.driver,
+        "tunnel": f"{plan.name}, {settings.lining or plan.default_lining}, {shown.length:.0f} m",
+        "seed": str(settings.seed),
+    }
+    shapes = planar_shapes(shown, settings.lining or plan.default_lining)
+    write_page(out, draw(env, params, shown, trace), shapes, float(params.vehicle.radius), facts)
+    ended = "success" if trace.success else "contact" if trace.contact else "no success"
+    print(f"{len(trace)} steps, {ended}: {out}")
+    if settings.open:
+        webbrowser.open(out.resolve().as_uri())
 
 
 if __name__ == "__main__":

@@ -20,10 +20,6 @@ from subterra_jax.host.versions import VERSION, other_schema
 from subterra_jax.lidar3d.surface import read_axis
 from subterra_jax.policies.files import PolicyError, read
 from subterra_jax.tasks import TaskError, find
-from subterra_jax.viewer.config import ViewerError
-from subterra_jax.viewer.recording import load as load_episode
-from subterra_jax.viewer.recording import save as save_episode
-from tests.subterra_jax.viewer.episodes import straight
 from train import checkpoint
 from train.checkpoint import CheckpointError
 from train.world import library_versions
@@ -118,15 +114,6 @@ def test_a_checkpoint_of_another_version_says_what_to_do(tmp_path):
         facts.write_text(json.dumps({**json.loads(facts.read_text()), "schema": f"{name}/{told}"}))
         with pytest.raises(CheckpointError, match=says):
             checkpoint.load_checkpoint(tmp_path)
-
-
-def test_an_episode_of_another_version_says_what_to_do(tmp_path):
-    save_episode(straight(), tmp_path / "now.npz")
-    with np.load(tmp_path / "now.npz") as data:
-        name = str(data["schema"]).rpartition("/")[0]
-    for told, says in ((0, "older .* save the episode again"), (99, "newer .* --upgrade")):
-        with pytest.raises(ViewerError, match=says):
-            load_episode(other(tmp_path / "now.npz", tmp_path / "other.npz", f"{name}/{told}"))
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import pytest
 import subterra_jax as st
 from subterra_jax.baselines import registry
 from subterra_jax.evaluation import Episodes, evaluate
-from subterra_jax.viewer import library
+from subterra_jax.recorder.trace import drive
 from tests.subterra_jax import tunnels
 from tests.subterra_jax.net.robots import FEW, MANY, advanced, assert_mean, begun, driven, made, observed, placed
 
@@ -38,7 +38,7 @@ def blocked(plan_of):
 
 
 @pytest.mark.parametrize("name", ["dead-reckoning"])
-def test_neither_evaluation_nor_viewer_counts_coverage_in_contact_as_success(blocked, name):
+def test_neither_evaluation_nor_trace_counts_coverage_in_contact_as_success(blocked, name):
     env, params = st.make("Subterra/Traverse-v1", tunnel=blocked, lining="smooth")
     one = np.zeros(4, np.int32)
     episodes = Episodes(np.arange(4, dtype=np.uint32), one, one, one)
@@ -46,8 +46,8 @@ def test_neither_evaluation_nor_viewer_counts_coverage_in_contact_as_success(blo
     assert (records.coverage >= 0.9).any()
     assert records.contact.all()
     assert not records.success.any()
-    *_, whole = library.drive_episode(blocked, "0", "blocked", "smooth", "Subterra/Traverse-v1", name, 0)
-    assert (whole.contact, whole.success) == (1.0, 0.0)
+    trace = drive(env, params, registry.make_agent(name, params), 0)
+    assert (trace.contact, trace.success) == (True, False)
 
 
 def among_boxes(id, n):

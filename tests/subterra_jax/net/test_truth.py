@@ -8,7 +8,6 @@ import subterra_jax as st
 from subterra_jax.baselines import registry
 from subterra_jax.evaluation import Episodes, evaluate
 from subterra_jax.recorder import RecorderConfig, record
-from subterra_jax.viewer import library
 from tests.subterra_jax.net.robots import begun, driven, made
 from tests.subterra_jax.probes import PROBES
 
@@ -33,14 +32,6 @@ def test_the_evaluation_gives_an_agent_what_it_declares_and_no_more(name):
 def test_the_recorder_gives_an_agent_what_it_declares_and_no_more(name, tmp_path):
     trace = record(RecorderConfig(out=tmp_path / "one", task="TraverseShort", agent=probe(name), steps=3))
     np.testing.assert_allclose(trace.command[:, 0], PROBES[name][1], rtol=1e-4)
-
-
-@pytest.mark.parametrize("name", ["nothing", "truth"])
-def test_the_viewer_gives_an_agent_what_it_declares_and_no_more(name):
-    plan = st.load_tunnel()
-    parts = library.drive_episode(plan, "0", "t", "smooth", "Subterra/TraverseShort-v1", probe(name), 0)
-    next(parts)
-    np.testing.assert_allclose(next(parts).command[1:, 0], PROBES[name][1], rtol=1e-4)
 
 
 def test_the_truth_that_is_handed_out_is_the_truth():
