@@ -201,7 +201,8 @@ def _carrier(radius: float, lidar_height: float) -> trimesh.Trimesh:
         mesh.apply_translation(part.middle)
         mesh.visual = trimesh.visual.ColorVisuals(mesh, face_colors=(*part.colour, 255))
         meshes.append(mesh)
-    return trimesh.util.concatenate(meshes)
+    whole: Any = trimesh.util.concatenate(meshes)
+    return whole
 
 
 def _painted(parts: Any) -> Any:
