@@ -17,6 +17,8 @@ from matplotlib.collections import LineCollection
 from matplotlib.patches import Circle
 from matplotlib.transforms import Affine2D
 from PIL import Image
+from subterra_jax.viewer.driving import drive
+from subterra_jax.viewer.recording import Recording
 
 import subterra_jax as st
 from benchmarks.command import BenchmarkError, run_main
@@ -27,8 +29,6 @@ from subterra_jax.parts.spatial_lidar import SENSORS
 from subterra_jax.state import EnvParams
 from subterra_jax.tunnel import Tunnel
 from subterra_jax.tunnel_env import TunnelEnv
-from subterra_jax.viewer.driving import drive
-from subterra_jax.viewer.recording import Recording
 
 _AHEAD, _ASIDE = 20.0, 4.5  # half sides of what the plan shows, m
 _PICTURE = 80  # time of a picture on screen, ms
