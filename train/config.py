@@ -68,6 +68,8 @@ class TrainConfig:
         standing: Share of the largest speed by which the range of actions goes below 0, where a robot stands.
         init_std: Standard deviation of the untrained policy before the tanh, in units of half the action range.
         init_turn: The same for the yaw rate; left out it is `init_std`.
+        last_std: Largest standard deviation in the last iteration; the limit falls evenly on a logarithmic scale. A
+            policy drives by its mean, and that of a broad one stops short of where its draws do. None sets no limit.
         learning_rate: Learning rate of Adam, at the start and at most.
         last_rate: Share of the learning rate that is left in the last iteration; it falls evenly.
         target_kl: The learning rate falls where an update moves the policy further than about this divergence; 0 keeps
@@ -111,6 +113,7 @@ class TrainConfig:
     standing: float = 0.5
     init_std: float = 0.5
     init_turn: float | None = None
+    last_std: float | None = None
     learning_rate: float = 4e-4
     last_rate: float = 1.0
     target_kl: float = 0.0
@@ -266,6 +269,7 @@ def check(config: TrainConfig) -> TrainConfig:
         raise ConfigError(f"map = True is for front = match, and front = {config.front}")
     positive(config, "map_cell", "localiser_rate", "learning_rate", "init_std", "max_grad_norm", "clip")
     not_negative(config, "standing", "entropy_weight", "value_weight", "auxiliary_weight", "stop_coverage", "target_kl")
+    positive(config, *(name for name in ("init_turn", "last_std") if getattr(config, name) is not None))
     share(config, "discount", "gae_lambda", "last_rate")
     return config
 

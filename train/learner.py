@@ -1,9 +1,11 @@
 """One iteration of PPO as one pure function: an unroll, its advantages, and the epochs that learn from it."""
 
+import dataclasses
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from flax import struct
 from jaxtyping import Array, Float, Int, PRNGKeyArray
@@ -227,7 +229,18 @@ class Learner(devices.Whole):
         keys = jax.random.split(key, config.epochs)
         order = jax.vmap(lambda key: jax.random.permutation(key, config.minibatches))(keys)
         student, losses = jax.lax.scan(minibatch, student, order.reshape(-1))
-        return student, jax.tree.map(jnp.mean, losses)
+        return self._narrowed(student, iteration), jax.tree.map(jnp.mean, losses)
+
+    def _narrowed(self, student: Student, iteration: Array) -> Student:
+        """Returns the weights with standard deviations within their limit."""
+        last = self.config.last_std
+        if last is None:
+            return student
+        spread = self.driver.layout.shape.spread
+        done = (iteration + 1) / self.config.iterations
+        limit = np.log(spread) + done * np.log(np.minimum(last / spread, 1.0))
+        log_std = jnp.minimum(student.weights["log_std"], limit)
+        return dataclasses.replace(student, weights={**student.weights, "log_std": log_std})
 
     def _loss(self, weights: Any, batch: Batch) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
         """Computes the loss of one minibatch and its parts.

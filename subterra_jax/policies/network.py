@@ -36,6 +36,13 @@ class Shape:
     n_seen: int = 0  # Inputs that the actor sees; the critic sees all. 0 is all.
     init_turn: float | None = None  # the same for its second number, the yaw rate; None is `init_std`
 
+    @property
+    def spread(self) -> np.ndarray:
+        """Standard deviations of the untrained policy before the tanh."""
+        spread = np.full(self.n_action, self.init_std)
+        spread[1:2] = self.init_turn or self.init_std
+        return spread
+
 
 @struct.dataclass
 class Outputs:
@@ -113,9 +120,7 @@ class Network(nn.Module):
         dtype = jnp.bfloat16 if shape.half else jnp.float32
         self.actor = Perceptron((*shape.hidden, shape.n_action), 0.01, dtype)
         self.critic = Perceptron((*shape.hidden, 1), 1.0, dtype)
-        spread = np.full(shape.n_action, shape.init_std)
-        spread[1:2] = shape.init_turn or shape.init_std
-        self.log_std = self.param("log_std", lambda key: jnp.asarray(np.log(spread), jnp.float32))
+        self.log_std = self.param("log_std", lambda key: jnp.asarray(np.log(shape.spread), jnp.float32))
         if shape.cell:
             self.cell = Cell(shape.cell, dtype)
         if shape.way_at is not None:
