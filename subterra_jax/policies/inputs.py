@@ -18,6 +18,7 @@ from subterra_jax.state import EnvParams
 _NEAR = 3.0  # m; ranges below this are resolved finely
 _SCALES = (1.0, 4.0, 20.0)  # m; scales of the way to go
 FAR = 100.0  # m; the largest scale
+_AROUND = 2.2  # rad; who has turned so far since the flag drives back
 _KNOWN = LIDAR_ENTRIES | {"odometry", "goal", "ring_pitch", "start", "flag"}
 
 
@@ -30,23 +31,28 @@ class Reckoned:
     distance: Float[Array, ""]  # odometer's distance at the flag, or at the start, m
     heading: Float[Array, ""]  # odometer's heading there, rad
     obeyed: Float[Array, ""]  # distance commanded since then, m
+    turned: Bool[Array, ""]  # true once the robot has turned round after the flag, wherever the tunnel bends later
 
 
 def begin(obs: Observed) -> Reckoned:
     """Returns the reckoning at the first observation of an episode."""
-    return Reckoned(jnp.zeros(2), jnp.zeros(()), jnp.asarray(obs.distance), jnp.asarray(obs.heading), jnp.zeros(()))
+    zero, no = jnp.zeros(()), jnp.zeros((), bool)
+    return Reckoned(jnp.zeros(2), zero, jnp.asarray(obs.distance), jnp.asarray(obs.heading), zero, no)
 
 
 def see(before: Reckoned, obs: Observed) -> Reckoned:
     """Returns the reckoning with an observation; at the flag it begins anew."""
     raised = (obs.flag > 0.5) & (before.flag < 0.5)
     anew = lambda new, old: jnp.where(raised, new, old)  # noqa: E731
+    flag = jnp.maximum(before.flag, jnp.asarray(obs.flag, jnp.float32))
+    heading = anew(obs.heading, before.heading)
     return dataclasses.replace(
         before,
-        flag=jnp.maximum(before.flag, jnp.asarray(obs.flag, jnp.float32)),
+        flag=flag,
         distance=anew(obs.distance, before.distance),
-        heading=anew(obs.heading, before.heading),
+        heading=heading,
         obeyed=anew(0.0, before.obeyed),
+        turned=before.turned | ((flag > 0.5) & (jnp.abs(wrap(obs.heading - heading)) > _AROUND)),
     )
 
 
@@ -121,8 +127,3 @@ def _phase(obs: Observed, now: Reckoned) -> Float[Array, "2"]:
     pitch = jnp.asarray(obs.ring_pitch, jnp.float32)
     turn = 2.0 * jnp.pi * (obs.distance - now.distance) / jnp.maximum(pitch, 0.5)
     return jnp.where(pitch > 0.0, 1.0, 0.0) * jnp.stack([jnp.sin(turn), jnp.cos(turn)])
-
-
-def is_turned(now: Reckoned, obs: Observed) -> Bool[Array, ""]:
-    """Tells whether the robot faces back since the flag was raised."""
-    return (now.flag > 0.5) & (jnp.abs(wrap(obs.heading - now.heading)) > 2.2)

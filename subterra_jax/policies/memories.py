@@ -115,13 +115,12 @@ class Memory:
             assert kept.located is not None, "dead reckoning needs the observation"
             station = kept.located.station
             return station.station, station.log_sigma, station.direction
-        turned = inputs.is_turned(kept.reckoned, obs)
         way = inputs.way_to_go(kept.reckoned, obs, params)
         target = obs.goal if params.errand in ("stop", "return") else params.tunnel.length
         out = target - way
         if params.errand == "return":
             out = jnp.where(kept.reckoned.flag > 0.5, told_start(obs, params) + way, out)
-        return out, jnp.log(jnp.float32(1.0)), jnp.where(turned, -1.0, 1.0)
+        return out, jnp.log(jnp.float32(1.0)), jnp.where(kept.reckoned.turned, -1.0, 1.0)
 
     def _look(self, reckoned: Reckoned, located: Located | None, obs: Observed, params: EnvParams) -> Array:
         way = inputs.way_to_go(reckoned, obs, params)
@@ -148,10 +147,9 @@ class Memory:
     ) -> Located:
         """Moves the walls and the localiser on by one command and the observation after it."""
         walls = CentreLine().look(before.walls, obs, command, params)
-        direction = jnp.where(inputs.is_turned(reckoned, obs), -1.0, 1.0) * jnp.ones(())
-        fresh = CentreLine().begin(obs, params)
-        turned = direction != before.direction
-        walls = jax.tree.map(lambda new, old: jnp.where(turned, new, old), fresh, walls)
+        direction = jnp.where(reckoned.turned, -1.0, 1.0)
+        mirrored, turned = CentreLine().turn_round(walls), direction != before.direction
+        walls = jax.tree.map(lambda new, old: jnp.where(turned, new, old), mirrored, walls)
         driven = Driven(command[0], CentreLine().cosine(walls), direction, raised, walls)
         station, memory = given.localiser(params).update(before.localiser, obs, driven, params, None)
         return Located(walls, direction, memory, station)

@@ -113,11 +113,12 @@ def test_after_the_flag_the_way_leads_back_to_the_start(plan):
     now = inputs.see(now, there)
     reach = float(params.goal.flag_reach)
     assert float(inputs.way_to_go(now, there, params)) == pytest.approx(out - reach, abs=1e-3)
+    assert not now.turned
     back = dataclasses.replace(there, distance=there.distance + 10.0, heading=obs.heading + 3.0)
     now = inputs.see(now, back)
     assert float(inputs.way_to_go(now, back, params)) == pytest.approx(out - reach - 10.0, abs=1e-3)
-    assert inputs.is_turned(now, back)
-    assert not inputs.is_turned(now, there)
+    bent = dataclasses.replace(back, heading=obs.heading + 1.0)
+    assert now.turned and inputs.see(now, bent).turned  # wherever the tunnel bends on the way back
 
 
 def test_a_filter_on_the_map_reports_what_it_believes_in_training_as_in_driving():
