@@ -35,48 +35,34 @@ python -m train --task StopAt-v1 --memory gru --auxiliary --out out/stop"""
 
 @dataclasses.dataclass(frozen=True)
 class Command:
-    """Trains a policy by PPO; defaults follow from `--task`, `--memory` and `--preset`.
+    """Trains a policy by PPO; defaults follow from `--task`, `--memory` and `--preset`."""
 
-    Attributes:
-        out: Run folder to write: checkpoint/, config.json, log.jsonl, log.csv, episodes.csv, curve.*, evaluation.json.
-        task: Task id; `FILE.py:ID` for one of your own.
-        tunnel: Tunnel file, or a name: `subterra-351`, `metro`, `control`, or several with commas between, of
-            which each episode draws one: `open:train:0-15`. Left out it is a few of `open:train`, and for a task that
-            covers a tunnel the packaged one.
-        lining: Variant of the walls; the tunnel's usual one if left out.
-        sensor: LiDAR; `planar16` is the task's own.
-        hidden_start: The true start is off the one that is reported.
-        val: Tunnels of the evaluation after training; those of the training if left out.
-        preset: `cpu` or `gpu`; what jax runs on if left out.
-        seeds: Train these seeds at once, each into `out/seed-<k>`.
-        resume: Go on from the newest checkpoint, or from the beginning.
-        overwrite: Throw away the run that `out` holds.
-        evaluation_episodes: Episodes of the evaluation after training, of 500; 0 leaves it out.
-        embodiment: `scout`, the tasks' robot; or `b2`, tried on four legs afterwards.
-        settings: YAML, TOML or JSON file with options, or a run's `config.json`; options override it.
-        legs: The trial of `--embodiment b2`.
-        logs: Further places to log to.
-        cluster: Other processes to train with.
-        config: Settings of PPO.
-    """
-
+    # run folder to write: checkpoint/, config.json, log.jsonl, log.csv, episodes.csv, curve.*, evaluation.json
     out: Path
-    task: str = DEFAULT_TASK
+    task: str = DEFAULT_TASK  # task id; `FILE.py:ID` for one of your own
+    # Tunnel file, or a name: `subterra-351`, `metro`, `control`, or several with commas between, of which each
+    # episode draws one: `open:train:0-15`. Left out it is a few of `open:train`, and for a task that covers a
+    # tunnel the packaged one.
     tunnel: Path | None = None
-    lining: str | None = None
+    lining: str | None = None  # variant of the walls; the tunnel's usual one if left out
+    # LiDAR; `planar16` is the task's own
     sensor: Literal["planar16", "spin16x64", "vlp16", "os1-64", "avia"] = "planar16"
-    hidden_start: bool = False
-    val: Path | None = None
-    preset: str | None = None
-    seeds: tuple[int, ...] = ()
-    resume: bool = False
-    overwrite: bool = False
-    evaluation_episodes: int = 200
-    embodiment: Literal["scout", "b2"] = "scout"
+    hidden_start: bool = False  # the true start is off the one that is reported
+    val: Path | None = None  # tunnels of the evaluation after training; those of the training if left out
+    preset: str | None = None  # `cpu` or `gpu`; what jax runs on if left out
+    seeds: tuple[int, ...] = ()  # train these seeds at once, each into `out/seed-<k>`
+    resume: bool = False  # go on from the newest checkpoint, or from the beginning
+    overwrite: bool = False  # throw away the run that `out` holds
+    evaluation_episodes: int = 200  # episodes of the evaluation after training, of 500; 0 leaves it out
+    embodiment: Literal["scout", "b2"] = "scout"  # `scout`, the tasks' robot; or `b2`, tried on four legs afterwards
+    # YAML, TOML or JSON file with options, or a run's `config.json`; options override it
     settings: Annotated[Path | None, tyro.conf.arg(name="config")] = None
-    legs: Legs = dataclasses.field(default_factory=Legs)
+    legs: Legs = dataclasses.field(default_factory=Legs)  # the trial of `--embodiment b2`
+    # further places to log to
     logs: Annotated[Logs, tyro.conf.OmitArgPrefixes] = dataclasses.field(default_factory=Logs)
+    # other processes to train with
     cluster: Annotated[Cluster, tyro.conf.OmitArgPrefixes] = dataclasses.field(default_factory=Cluster)
+    # settings of PPO
     config: Annotated[TrainConfig, tyro.conf.OmitArgPrefixes] = dataclasses.field(default_factory=TrainConfig)
 
 

@@ -32,17 +32,11 @@ class CheckpointError(SubterraError):
 
 @dataclasses.dataclass(frozen=True)
 class Stored:
-    """A checkpoint as read: checked against its digest, not yet against any network.
+    """A checkpoint as read: checked against its digest, not yet against any network."""
 
-    Attributes:
-        path: Folder of the checkpoint.
-        facts: The JSON file.
-        arrays: Every array, by the name of its place.
-    """
-
-    path: Path
-    facts: dict[str, Any]
-    arrays: dict[str, np.ndarray]
+    path: Path  # folder of the checkpoint
+    facts: dict[str, Any]  # the JSON file
+    arrays: dict[str, np.ndarray]  # every array, by the name of its place
 
     def restore(self, name: str, like: Any) -> Any:
         """Restores one of the trees that were saved.

@@ -46,94 +46,63 @@ def share(config: Any, *names: str) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class TrainConfig:
-    """Settings of PPO; a preset fills them in, the command line may change each.
+    """Settings of PPO; a preset fills them in, the command line may change each."""
 
-    Attributes:
-        seed: Seed of everything random in the run.
-        steps: Environment steps to train for, all environments together; rounded up to whole iterations.
-        memory: `none`; `stack`: the last `frames` observations; `gru`: a network that remembers; `along`: the learnt
-            localiser, which looks along the metres that it has passed; `map`: a histogram filter on the map.
-        frames: Observations that the network sees at once.
-        cell: Width of the GRU.
-        auxiliary: Learn what only the simulator knows as well: with `gru` the error of the way to go, with `along` the
-            true station. It is a target and never an input.
-        map_cell: Length of a cell of the filter, m; for `map`.
-        begin_from: Policy whose weights are taken where they fit, by name, file or run folder: network, localiser.
-        n_envs: Environments stepped together.
-        unroll: Steps of each environment in one iteration; with `gru`, the length of back-propagation through time.
-        epochs: Passes over the data of one iteration.
-        minibatches: Minibatches per pass; each holds whole unrolls of `n_envs / minibatches` environments.
-        hidden: Widths of the hidden layers, of policy and value alike.
-        half: Compute in bfloat16; weights stay float32.
-        standing: Share of the largest speed by which the range of actions goes below 0, where a robot stands.
-        init_std: Standard deviation of the untrained policy before the tanh, in units of half the action range.
-        init_turn: The same for the yaw rate; left out it is `init_std`.
-        last_std: Largest standard deviation in the last iteration; the limit falls evenly on a logarithmic scale. A
-            policy drives by its mean, and that of a broad one stops short of where its draws do. None sets no limit.
-        learning_rate: Learning rate of Adam, at the start and at most.
-        last_rate: Share of the learning rate that is left in the last iteration; it falls evenly.
-        target_kl: The learning rate falls where an update moves the policy further than about this divergence; 0 keeps
-            it constant.
-        max_grad_norm: Gradients are scaled down to this norm.
-        discount: Per control period.
-        gae_lambda: Mix of one-step and n-step advantages.
-        clip: Half-width of the trust region of the probability ratio.
-        entropy_weight: Reward for randomness, in units of the loss.
-        value_weight: Weight of the value loss.
-        auxiliary_weight: Weight of the auxiliary loss of `gru`.
-        front: Errors of the command that the localiser compares: `match` of slip, `wide` of wet rail too.
-        map: The localiser learns to take a map as well.
-        drives: Drives that the localiser learns from in one iteration.
-        drive_steps: Steps of each.
-        drives_minibatch: Drives in one step of the localiser's optimiser.
-        localiser_rate: Its learning rate, at most.
-        stop_coverage: Training ends once the rolling-100 coverage is at least this (a share of the tunnel)
-            and every one of those episodes succeeded; a value above 1 never stops.
-        stop_patience: For how many iterations in a row that must hold.
-        checkpoint_every: Iterations between checkpoints; one is written at the end in any case.
-        parts: Parts that the environments are split into, each with draws of its own. As many devices as divide them
-            share them out; the result does not depend on how many those are.
-        sums: `ordered`: one seed gives one result on a GPU as well. `any`: a GPU adds up in any order.
-    """
-
-    seed: int = 0
-    steps: int = 1_500_000
+    seed: int = 0  # seed of everything random in the run
+    steps: int = 1_500_000  # environment steps to train for, all environments together; rounded up to whole iterations
+    # `none`; `stack`: the last `frames` observations; `gru`: a network that remembers; `along`: the learnt
+    # localiser, which looks along the metres that it has passed; `map`: a histogram filter on the map
     memory: Literal["none", "stack", "gru", "along", "map"] = "none"
-    frames: int = 1
-    cell: int = 128
+    frames: int = 1  # observations that the network sees at once
+    cell: int = 128  # width of the GRU
+    # Learn what only the simulator knows as well: with `gru` the error of the way to go, with `along` the true
+    # station. It is a target and never an input.
     auxiliary: bool = False
-    map_cell: float = 0.25
+    map_cell: float = 0.25  # length of a cell of the filter, m; for `map`
+    # policy whose weights are taken where they fit, by name, file or run folder: network, localiser
     begin_from: str | None = None
-    n_envs: int = 128
+    n_envs: int = 128  # environments stepped together
+    # steps of each environment in one iteration; with `gru`, the length of back-propagation through time
     unroll: int = 64
-    epochs: int = 4
-    minibatches: int = 4
-    hidden: tuple[int, ...] = (64, 64)
-    half: bool = False
-    standing: float = 0.5
+    epochs: int = 4  # passes over the data of one iteration
+    minibatches: int = 4  # minibatches per pass; each holds whole unrolls of `n_envs / minibatches` environments
+    hidden: tuple[int, ...] = (64, 64)  # widths of the hidden layers, of policy and value alike
+    half: bool = False  # compute in bfloat16; weights stay float32
+    standing: float = 0.5  # share of the largest speed by which the range of actions goes below 0, where a robot stands
+    # standard deviation of the untrained policy before the tanh, in units of half the action range
     init_std: float = 0.5
-    init_turn: float | None = None
+    init_turn: float | None = None  # the same for the yaw rate; left out it is `init_std`
+    # Largest standard deviation in the last iteration; the limit falls evenly on a logarithmic scale. A policy
+    # drives by its mean, and that of a broad one stops short of where its draws do. None sets no limit.
     last_std: float | None = None
-    learning_rate: float = 4e-4
-    last_rate: float = 1.0
+    learning_rate: float = 4e-4  # learning rate of Adam, at the start and at most
+    last_rate: float = 1.0  # share of the learning rate that is left in the last iteration; it falls evenly
+    # the learning rate falls where an update moves the policy further than about this divergence; 0 keeps it
+    # constant
     target_kl: float = 0.0
-    max_grad_norm: float = 0.5
-    discount: float = 0.997
-    gae_lambda: float = 0.95
-    clip: float = 0.2
-    entropy_weight: float = 2e-3
-    value_weight: float = 0.5
-    auxiliary_weight: float = 0.1
+    max_grad_norm: float = 0.5  # gradients are scaled down to this norm
+    discount: float = 0.997  # per control period
+    gae_lambda: float = 0.95  # mix of one-step and n-step advantages
+    clip: float = 0.2  # half-width of the trust region of the probability ratio
+    entropy_weight: float = 2e-3  # reward for randomness, in units of the loss
+    value_weight: float = 0.5  # weight of the value loss
+    auxiliary_weight: float = 0.1  # weight of the auxiliary loss of `gru`
+    # errors of the command that the localiser compares: `match` of slip, `wide` of wet rail too
     front: Literal["match", "wide"] = "match"
-    map: bool = False
-    drives: int = 32
-    drive_steps: int = 300
-    drives_minibatch: int = 64
-    localiser_rate: float = 2e-3
+    map: bool = False  # the localiser learns to take a map as well
+    drives: int = 32  # drives that the localiser learns from in one iteration
+    drive_steps: int = 300  # steps of each
+    drives_minibatch: int = 64  # drives in one step of the localiser's optimiser
+    localiser_rate: float = 2e-3  # its learning rate, at most
+    # training ends once the rolling-100 coverage is at least this (a share of the tunnel) and every one of those
+    # episodes succeeded; a value above 1 never stops
     stop_coverage: float = 2.0
-    stop_patience: int = 40
-    checkpoint_every: int = 50
+    stop_patience: int = 40  # for how many iterations in a row that must hold
+    checkpoint_every: int = 50  # iterations between checkpoints; one is written at the end in any case
+    # Parts that the environments are split into, each with draws of its own. As many devices as divide them share
+    # them out; the result does not depend on how many those are.
     parts: int = 1
+    # `ordered`: one seed gives one result on a GPU as well. `any`: a GPU adds up in any order.
     sums: Literal["ordered", "any"] = "ordered"
 
     # What may differ when a run goes on; nothing else may.
@@ -276,14 +245,8 @@ def check(config: TrainConfig) -> TrainConfig:
 
 @dataclasses.dataclass(frozen=True)
 class Legs:
-    """The trial on four legs after training.
+    """The trial on four legs after training."""
 
-    Attributes:
-        gait: A file, the name of a released gait, or `trot`.
-        robots: Number of robots; 0 leaves the trial out.
-        engine: `mjx`, or `mujoco` in C on the host.
-    """
-
-    gait: str = RELEASED
-    robots: int = 100
-    engine: Literal["mjx", "mujoco"] = "mjx"
+    gait: str = RELEASED  # A file, the name of a released gait, or `trot`
+    robots: int = 100  # number of robots; 0 leaves the trial out
+    engine: Literal["mjx", "mujoco"] = "mjx"  # `mjx`, or `mujoco` in C on the host

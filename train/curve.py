@@ -140,16 +140,11 @@ def _draw_band(axes: Any, curves: list[np.ndarray]) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class Command:
-    """Draws the coverage curve of one or several runs.
+    """Draws the coverage curve of one or several runs."""
 
-    Attributes:
-        runs: Run folders.
-        out: The figure.
-        lines: Shares to draw as lines, by name: `--lines floor 0.32 ceiling 0.997`.
-    """
-
-    runs: tyro.conf.Positional[tuple[Path, ...]]
-    out: Path = Path("curve.png")
+    runs: tyro.conf.Positional[tuple[Path, ...]]  # run folders
+    out: Path = Path("curve.png")  # the figure
+    # shares to draw as lines, by name: `--lines floor 0.32 ceiling 0.997`
     lines: dict[str, float] = dataclasses.field(default_factory=dict)
 
 

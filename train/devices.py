@@ -154,17 +154,11 @@ _POD = "JOB_COMPLETION_INDEX"
 
 @dataclasses.dataclass(frozen=True)
 class Cluster:
-    """Processes that train together; by default as the launcher says, or this process alone.
+    """Processes that train together; by default as the launcher says, or this process alone."""
 
-    Attributes:
-        coordinator: Address and port of process 0, `host:port`.
-        processes: Number of processes.
-        process: Number of this process, from 0; in an indexed job of Kubernetes it need not be given.
-    """
-
-    coordinator: str | None = None
-    processes: int | None = None
-    process: int | None = None
+    coordinator: str | None = None  # address and port of process 0, `host:port`
+    processes: int | None = None  # number of processes
+    process: int | None = None  # number of this process, from 0; in an indexed job of Kubernetes it need not be given
 
 
 def find_launcher(environment: Mapping[str, str]) -> str | None:

@@ -21,30 +21,20 @@ _HALF_LOG_TAU = 0.5 * math.log(2.0 * math.pi)
 
 @struct.dataclass
 class Policy:
-    """All that driving needs.
+    """All that driving needs."""
 
-    Attributes:
-        network: Weights of the network.
-        localiser: Weights of the localiser; None without one.
-        statistics: Mean and standard deviation of the observation; None where the inputs are of order 1 as they are.
-    """
-
-    network: Any
-    localiser: Any = None
+    network: Any  # weights of the network
+    localiser: Any = None  # weights of the localiser; None without one
+    # mean and standard deviation of the observation; None where the inputs are of order 1 as they are
     statistics: Any = None
 
 
 @struct.dataclass
 class Seen:
-    """Observations, and where they were made.
+    """Observations, and where they were made."""
 
-    Attributes:
-        flat: The observation.
-        tunnel: Number of the tunnel that a robot is in, of a stack.
-    """
-
-    flat: Float[Array, "*env n_obs"]
-    tunnel: Int[Array, "*env"]
+    flat: Float[Array, "*env n_obs"]  # the observation
+    tunnel: Int[Array, "*env"]  # number of the tunnel that a robot is in, of a stack
 
     def here(self, params: Any) -> Any:
         """Returns the params of one robot's own tunnel."""

@@ -24,19 +24,12 @@ _END = 5.0  # m before the end of the tunnel at which a drive ends
 
 @struct.dataclass
 class Drives:
-    """Drives of a batch.
+    """Drives of a batch."""
 
-    Attributes:
-        record: As the robots saw them.
-        moved: True distance along the axis since the start, m.
-        start: True station of the start, m.
-        tunnel: Number of the tunnel.
-    """
-
-    record: Record
-    moved: Float[Array, "env time"]
-    start: Float[Array, "env"]
-    tunnel: Float[Array, "env"]
+    record: Record  # as the robots saw them
+    moved: Float[Array, "env time"]  # true distance along the axis since the start, m
+    start: Float[Array, "env"]  # true station of the start, m
+    tunnel: Float[Array, "env"]  # number of the tunnel
 
 
 def record_drives(driver: Driver, policy: Policy, params: Any, key: PRNGKeyArray, n_envs: int, n_steps: int) -> Drives:

@@ -68,27 +68,20 @@ def scores(records: Records) -> dict[str, Any]:
 
 @dataclasses.dataclass(frozen=True)
 class Command:
-    """Scores a trained policy without its exploration noise, on the fixed list of episodes.
+    """Scores a trained policy without its exploration noise, on the fixed list of episodes."""
 
-    Attributes:
-        policy: Run folder of `train`, one checkpoint in it, a `.safetensors` file, or the name of a released
-            policy; the one released for the task if left out.
-        task: Task id; the one it was trained on if left out.
-        tunnel: Tunnel file or names, as in training; the packaged tunnel, or a few of `open:train`, if left out.
-        lining: Variant of the walls; the tunnel's usual one if left out.
-        episodes: Episodes to drive, the first of the task's 500.
-        without: Go without a part, for an ablation: the `start` is told 40 m off; `front`: the localiser reads no
-            walls; `walls`: no beam has an echo; `odometry` stands still; `memory`: the way is dead-reckoned.
-        json: One line of JSON instead of a table.
-    """
-
+    # run folder of `train`, one checkpoint in it, a `.safetensors` file, or the name of a released policy; the
+    # one released for the task if left out
     policy: Path | None = None
-    task: str | None = None
+    task: str | None = None  # task id; the one it was trained on if left out
+    # tunnel file or names, as in training; the packaged tunnel, or a few of `open:train`, if left out
     tunnel: Path | None = None
-    lining: str | None = None
-    episodes: int = N_LISTED
+    lining: str | None = None  # variant of the walls; the tunnel's usual one if left out
+    episodes: int = N_LISTED  # episodes to drive, the first of the task's 500
+    # go without a part, for an ablation: the `start` is told 40 m off; `front`: the localiser reads no walls;
+    # `walls`: no beam has an echo; `odometry` stands still; `memory`: the way is dead-reckoned
     without: Part | None = None
-    json: bool = False
+    json: bool = False  # one line of JSON instead of a table
 
 
 def command(arguments: Command) -> None:

@@ -23,34 +23,21 @@ _LEARNING_RATE_STEP = 1.2
 
 @struct.dataclass
 class Student:
-    """Weights, and the state of their optimiser.
+    """Weights, and the state of their optimiser."""
 
-    Attributes:
-        weights: Of the network.
-        moments: State of Adam.
-        learning_rate: Follows the divergence between updates.
-    """
-
-    weights: Any
-    moments: Any
-    learning_rate: Float[Array, ""]
+    weights: Any  # Of the network
+    moments: Any  # state of Adam
+    learning_rate: Float[Array, ""]  # follows the divergence between updates
 
 
 @struct.dataclass
 class Batch:
-    """What is learnt from: a rollout of some environments with advantages and value targets.
+    """What is learnt from: a rollout of some environments with advantages and value targets."""
 
-    Attributes:
-        memory: Memory of the network at the first step.
-        rollout: As stored.
-        advantage: Advantage of every action, in units of the reward scale.
-        target: For the value function, in the same units.
-    """
-
-    memory: Float[Array, "env cell"]
-    rollout: Rollout
-    advantage: Float[Array, "time env"]
-    target: Float[Array, "time env"]
+    memory: Float[Array, "env cell"]  # memory of the network at the first step
+    rollout: Rollout  # as stored
+    advantage: Float[Array, "time env"]  # advantage of every action, in units of the reward scale
+    target: Float[Array, "time env"]  # for the value function, in the same units
 
     def block(self, number: Array, width: int) -> "Batch":
         """Returns a block of `width` environments."""
@@ -60,27 +47,16 @@ class Batch:
 
 @struct.dataclass
 class TrainState:
-    """State of a run between two iterations.
+    """State of a run between two iterations."""
 
-    Attributes:
-        student: Weights, Adam's moments and the learning rate.
-        localiser: Weights of the localiser and its optimiser's moments; None without one.
-        statistics: Of the observation, where it is normalised; else None.
-        return_statistics: Spread of the discounted return, by which rewards are divided.
-        discounted: Discounted return of each episode so far, `(env,)`.
-        drive: State of the environments.
-        key: Source of all later randomness.
-        iteration: Iterations done.
-    """
-
-    student: Student
-    localiser: Any
-    statistics: Any
-    return_statistics: learning.Statistics
-    discounted: Float[Array, "env"]
-    drive: Drive
-    key: PRNGKeyArray
-    iteration: Int[Array, ""]
+    student: Student  # weights, Adam's moments and the learning rate
+    localiser: Any  # weights of the localiser and its optimiser's moments; None without one
+    statistics: Any  # Of the observation, where it is normalised; else None
+    return_statistics: learning.Statistics  # spread of the discounted return, by which rewards are divided
+    discounted: Float[Array, "env"]  # discounted return of each episode so far, `(env,)`
+    drive: Drive  # state of the environments
+    key: PRNGKeyArray  # source of all later randomness
+    iteration: Int[Array, ""]  # iterations done
 
 
 class Learner(devices.Whole):

@@ -16,17 +16,11 @@ _LARGEST = 10.0
 
 @struct.dataclass
 class Statistics:
-    """Running mean and standard deviation.
+    """Running mean and standard deviation."""
 
-    Attributes:
-        count: Numbers seen.
-        mean: Their mean.
-        square: Sum of squares of their distances from it.
-    """
-
-    count: Float[Array, ""]
-    mean: Float[Array, "*n"]
-    square: Float[Array, "*n"]
+    count: Float[Array, ""]  # numbers seen
+    mean: Float[Array, "*n"]  # their mean
+    square: Float[Array, "*n"]  # sum of squares of their distances from it
 
     @property
     def std(self) -> Float[Array, "*n"]:

@@ -28,17 +28,11 @@ _CHUNK = 16  # drives whose gradients are computed at once
 
 @struct.dataclass
 class LocaliserState:
-    """State of a localiser that learns.
+    """State of a localiser that learns."""
 
-    Attributes:
-        weights: As `locate.memory.init` makes them.
-        moments: State of its optimiser.
-        steps: Steps of the optimiser.
-    """
-
-    weights: Any
-    moments: Any
-    steps: Int[Array, ""]
+    weights: Any  # as `locate.memory.init` makes them
+    moments: Any  # state of its optimiser
+    steps: Int[Array, ""]  # steps of the optimiser
 
 
 class LocaliserLearner:

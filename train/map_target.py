@@ -19,21 +19,13 @@ _APART = 50.0  # m from the true place to that of a wrong map, at least
 
 @struct.dataclass
 class MapCase:
-    """Start and map that a robot is given.
+    """Start and map that a robot is given."""
 
-    Attributes:
-        offset: True station of the start less that given, m.
-        sigma: Standard deviation of the start that it is given, m.
-        tunnel: Tunnel of its map.
-        shift: Place on that map less the true one, m.
-        right: Whether the map is the right one.
-    """
-
-    offset: Float[Array, "*env"]
-    sigma: Float[Array, "*env"]
-    tunnel: Int[Array, "*env"]
-    shift: Float[Array, "*env"]
-    right: Bool[Array, "*env"]
+    offset: Float[Array, "*env"]  # true station of the start less that given, m
+    sigma: Float[Array, "*env"]  # standard deviation of the start that it is given, m
+    tunnel: Int[Array, "*env"]  # tunnel of its map
+    shift: Float[Array, "*env"]  # place on that map less the true one, m
+    right: Bool[Array, "*env"]  # whether the map is the right one
 
 
 def draw_cases(key: PRNGKeyArray, drive: Drives, params: Any) -> MapCase:

@@ -26,23 +26,14 @@ from train.world import PLANAR, World, library_versions, open_world
 
 @dataclasses.dataclass(frozen=True)
 class Command:
-    """Releases a trained policy with its scores on the task's fixed list of episodes.
+    """Releases a trained policy with its scores on the task's fixed list of episodes."""
 
-    Attributes:
-        run: Run folder of `train`, or one checkpoint in it.
-        out: The tensors' file, which ends in `.safetensors`; the facts go beside it.
-        tunnel: Tunnel file or name of the evaluation; the packaged tunnel if left out.
-        lining: Variant of the walls of the evaluation; the tunnel's usual one if left out.
-        episodes: Episodes of the evaluation.
-        half: Write the weights in float16.
-    """
-
-    run: tyro.conf.Positional[Path]
-    out: Path
-    tunnel: Path | None = None
-    lining: str | None = None
-    episodes: int = 500
-    half: bool = False
+    run: tyro.conf.Positional[Path]  # run folder of `train`, or one checkpoint in it
+    out: Path  # the tensors' file, which ends in `.safetensors`; the facts go beside it
+    tunnel: Path | None = None  # tunnel file or name of the evaluation; the packaged tunnel if left out
+    lining: str | None = None  # variant of the walls of the evaluation; the tunnel's usual one if left out
+    episodes: int = 500  # episodes of the evaluation
+    half: bool = False  # write the weights in float16
 
 
 def command(arguments: Command) -> None:

@@ -17,64 +17,39 @@ FIELDS = ("coverage", "success", "contact", "episode_return", "length")
 
 @struct.dataclass
 class Finished:
-    """The episodes that ended during an unroll, in place: read a field only where `done`.
+    """The episodes that ended during an unroll, in place: read a field only where `done`."""
 
-    Attributes:
-        done: The step was its episode's last.
-        coverage: Share of the tunnel covered, 0 to 1.
-        success: The task's goal was met.
-        contact: The episode ended at a wall or an obstacle.
-        episode_return: Undiscounted reward of the episode.
-        length: Steps of the episode.
-    """
-
-    done: Bool[Array, "time env"]
-    coverage: Float[Array, "time env"]
-    success: Bool[Array, "time env"]
-    contact: Bool[Array, "time env"]
-    episode_return: Float[Array, "time env"]
-    length: Int[Array, "time env"]
+    done: Bool[Array, "time env"]  # the step was its episode's last
+    coverage: Float[Array, "time env"]  # share of the tunnel covered, 0 to 1
+    success: Bool[Array, "time env"]  # the task's goal was met
+    contact: Bool[Array, "time env"]  # the episode ended at a wall or an obstacle
+    episode_return: Float[Array, "time env"]  # undiscounted reward of the episode
+    length: Int[Array, "time env"]  # steps of the episode
 
 
 @struct.dataclass
 class Ended:
-    """Those episodes as rows, by step and then by environment.
+    """Those episodes as rows, by step and then by environment."""
 
-    Attributes:
-        count: Number of episodes; may exceed the room for rows.
-        index: Of their last step in the flattened unroll, `(room,)`; rows from `count` on hold nothing.
-        coverage: As in `Finished`, and so on.
-        success: Likewise.
-        contact: Likewise.
-        episode_return: Likewise.
-        length: Likewise.
-    """
-
-    count: Any
-    index: Any
-    coverage: Any
-    success: Any
-    contact: Any
-    episode_return: Any
-    length: Any
+    count: Any  # number of episodes; may exceed the room for rows
+    index: Any  # Of their last step in the flattened unroll, `(room,)`; rows from `count` on hold nothing
+    coverage: Any  # as in `Finished`, and so on
+    success: Any  # likewise
+    contact: Any  # likewise
+    episode_return: Any  # likewise
+    length: Any  # likewise
 
 
 @struct.dataclass
 class Report:
-    """News of one iteration for the host.
+    """News of one iteration for the host."""
 
-    Attributes:
-        finished: `Finished`: episodes that ended; it stays on the device but for the rare iteration in which more have
-            ended than `ended` has room for.
-        ended: `Ended`: the same, small.
-        metrics: Scalars by name.
-        policy: The policy that drove, before it learnt from this iteration.
-    """
-
+    # `Finished`: episodes that ended; it stays on the device but for the rare iteration in which more have ended
+    # than `ended` has room for
     finished: Any
-    ended: Any
-    metrics: Any
-    policy: Any
+    ended: Any  # `Ended`: the same, small
+    metrics: Any  # scalars by name
+    policy: Any  # the policy that drove, before it learnt from this iteration
 
 
 def report(finished: Finished, metrics: dict[str, Float[Array, ""]], policy: Any) -> Report:

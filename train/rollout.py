@@ -14,49 +14,30 @@ from train.report import Finished
 
 @struct.dataclass
 class Drive:
-    """State of the environments between two unrolls.
+    """State of the environments between two unrolls."""
 
-    Attributes:
-        env_state: State of the batch of environments.
-        kept: What the policy keeps, with the observation to act upon next.
-        memory: Memory of its network, `(env, cell)`.
-        age: Steps since each episode began, `(env,)`.
-        episode_return: Undiscounted reward of each episode so far, `(env,)`.
-    """
-
-    env_state: Any
-    kept: Any
-    memory: Float[Array, "env cell"]
-    age: Int[Array, "env"]
-    episode_return: Float[Array, "env"]
+    env_state: Any  # state of the batch of environments
+    kept: Any  # what the policy keeps, with the observation to act upon next
+    memory: Float[Array, "env cell"]  # memory of its network, `(env, cell)`
+    age: Int[Array, "env"]  # steps since each episode began, `(env,)`
+    episode_return: Float[Array, "env"]  # undiscounted reward of each episode so far, `(env,)`
 
 
 @struct.dataclass
 class Rollout:
-    """Storage of one unroll, `(time, env, …)`.
+    """Storage of one unroll, `(time, env, …)`."""
 
-    Attributes:
-        inputs: Inputs that were acted upon.
-        first: The step begins an episode.
-        raw: The draw before the tanh.
-        log_prob: Log density of the draw.
-        value: Value of the state acted upon.
-        reward: Reward of the environment.
-        terminated: The episode ended for good.
-        truncated: The episode ended by the clock.
-        final_value: Value of the final observation of an episode that was truncated; 0 elsewhere.
-        error: True less reckoned way to go, m: the auxiliary target; no numbers without one. No input holds it.
-    """
-
-    inputs: Float[Array, "time env n"]
-    first: Bool[Array, "time env"]
-    raw: Float[Array, "time env action"]
-    log_prob: Float[Array, "time env"]
-    value: Float[Array, "time env"]
-    reward: Float[Array, "time env"]
-    terminated: Bool[Array, "time env"]
-    truncated: Bool[Array, "time env"]
+    inputs: Float[Array, "time env n"]  # inputs that were acted upon
+    first: Bool[Array, "time env"]  # the step begins an episode
+    raw: Float[Array, "time env action"]  # the draw before the tanh
+    log_prob: Float[Array, "time env"]  # log density of the draw
+    value: Float[Array, "time env"]  # value of the state acted upon
+    reward: Float[Array, "time env"]  # reward of the environment
+    terminated: Bool[Array, "time env"]  # the episode ended for good
+    truncated: Bool[Array, "time env"]  # the episode ended by the clock
+    # value of the final observation of an episode that was truncated; 0 elsewhere
     final_value: Float[Array, "time env"]
+    # True less reckoned way to go, m: the auxiliary target; no numbers without one. No input holds it.
     error: Float[Array, "time env n"]
 
 
@@ -71,19 +52,12 @@ def begin(env: Any, driver: Driver, policy: Policy, params: Any, key: PRNGKeyArr
 
 @struct.dataclass
 class Last:
-    """The last step of each environment that was cut off by the clock, from which its value is bootstrapped.
+    """The last step of each environment that was cut off by the clock, from which its value is bootstrapped."""
 
-    Attributes:
-        env_state: State after it.
-        kept: What the policy kept before it.
-        action: The action.
-        memory: Memory of the network after its inputs.
-    """
-
-    env_state: Any
-    kept: Any
-    action: Float[Array, "env action"]
-    memory: Float[Array, "env cell"]
+    env_state: Any  # state after it
+    kept: Any  # what the policy kept before it
+    action: Float[Array, "env action"]  # the action
+    memory: Float[Array, "env cell"]  # memory of the network after its inputs
 
 
 def collect(

@@ -24,17 +24,12 @@ class Sink(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class Logs:
-    """Places to log to, beside the files of the run folder.
+    """Places to log to, beside the files of the run folder."""
 
-    Attributes:
-        tensorboard: Write the log for TensorBoard as well.
-        log: Function that is called with every line of the log, a dictionary: `module:function` or `FILE.py:function`.
-        wandb: Project in Weights & Biases that gets every line as well.
-    """
-
-    tensorboard: bool = False
+    tensorboard: bool = False  # write the log for TensorBoard as well
+    # function that is called with every line of the log, a dictionary: `module:function` or `FILE.py:function`
     log: str | None = None
-    wandb: str | None = None
+    wandb: str | None = None  # project in Weights & Biases that gets every line as well
 
     def checked(self) -> "Logs":
         """Returns itself where all libraries and functions are there.

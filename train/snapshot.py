@@ -96,17 +96,11 @@ class EpisodeWindow:
 
 @dataclasses.dataclass(frozen=True)
 class Best:
-    """The last policy that did as well as any before it, as far as a hundred episodes tell.
+    """The last policy that did as well as any before it, as far as a hundred episodes tell."""
 
-    Attributes:
-        score: Mean success of the best hundred episodes, and their mean return.
-        iteration: The iteration of the policy.
-        policy: The policy that drove that iteration.
-    """
-
-    score: tuple[float, float]
-    iteration: int
-    policy: Any
+    score: tuple[float, float]  # mean success of the best hundred episodes, and their mean return
+    iteration: int  # the iteration of the policy
+    policy: Any  # the policy that drove that iteration
 
     @staticmethod
     def of(best: "Best | None", window: EpisodeWindow, iteration: int, policy: Any, *, keep: bool = True) -> "Best":
@@ -126,13 +120,9 @@ class Best:
 
 
 class Trainable(Protocol):
-    """A learner of any kind.
+    """A learner of any kind."""
 
-    Attributes:
-        driver: With `kind` and `layout`.
-    """
-
-    driver: Any
+    driver: Any  # with `kind` and `layout`
 
     @property
     def config(self) -> Any:
@@ -159,24 +149,16 @@ class Trainable(Protocol):
 
 @dataclasses.dataclass
 class Snapshot:
-    """A run between two iterations. With the same config it goes on exactly as if it had never stopped.
+    """A run between two iterations. With the same config it goes on exactly as if it had never stopped."""
 
-    Attributes:
-        iteration: Iterations done.
-        state: Everything on the device.
-        window: Finished episodes.
-        best: The best policy so far.
-        solved_for: Iterations in a row in which the goal held.
-        record: Log line of the last iteration; empty before the first.
-        rows: The episodes that finished in it, rows of `episodes.COLUMNS`.
-    """
-
-    iteration: int
-    state: Any
-    window: EpisodeWindow
-    best: Best
-    solved_for: int = 0
+    iteration: int  # iterations done
+    state: Any  # everything on the device
+    window: EpisodeWindow  # finished episodes
+    best: Best  # the best policy so far
+    solved_for: int = 0  # iterations in a row in which the goal held
+    # log line of the last iteration; empty before the first
     record: dict[str, Any] = dataclasses.field(default_factory=dict)
+    # the episodes that finished in it, rows of `episodes.COLUMNS`
     rows: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, COLUMNS))
 
     @property

@@ -27,17 +27,11 @@ _EACH = 4  # planar tunnels that take as long to make as a process to begin
 
 @dataclasses.dataclass(frozen=True)
 class Kind:
-    """Lining, bore and piece of a tunnel to make.
+    """Lining, bore and piece of a tunnel to make."""
 
-    Attributes:
-        lining: Variant of the walls; None is the usual one.
-        spatial: Make the bore in three dimensions too.
-        piece: Start and length of the piece to cut out, m; None keeps the whole.
-    """
-
-    lining: str | None
-    spatial: bool
-    piece: tuple[float, float] | None
+    lining: str | None  # variant of the walls; None is the usual one
+    spatial: bool  # make the bore in three dimensions too
+    piece: tuple[float, float] | None  # start and length of the piece to cut out, m; None keeps the whole
 
 
 def names_of(names: str) -> list[str]:

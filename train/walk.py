@@ -33,34 +33,25 @@ class Command:
     """Trains a gait by PPO. The defaults of the settings follow from `--preset`.
 
     Example: python -m train.walk --out out/walk --seeds 0 1 2 --release out/walk.safetensors
-
-    Attributes:
-        out: Run folder to write: checkpoint/, config.json, log.jsonl, episodes.csv, curve.png, evaluation.json.
-        tunnel: Tunnel file or name, its sleepers laid by standard; `subterra-351` if left out.
-        scene: Built scene folder, whose own sleepers are walked on; instead of a tunnel.
-        preset: `cpu` or `gpu`; what jax runs on if left out.
-        seeds: Train these seeds, one after the other, into `out/seed-<k>`; one run of `--seed` if left out.
-        resume: Go on from the newest checkpoint in `out`; from the beginning where there is none yet. Only the limits
-            on training may differ.
-        overwrite: Throw away the run that `out` holds.
-        robots: Robots of the evaluation after training, an episode of 20 s each.
-        release: Write the policy of the last seed there, a `.safetensors` file.
-        settings: YAML, TOML or JSON file with options, or a run's `config.json`; options override it.
-        logs: Further places to log to.
-        config: Settings of PPO.
     """
 
-    out: Path
-    tunnel: Path | None = None
-    scene: Path | None = None
-    preset: str | None = None
+    out: Path  # run folder to write: checkpoint/, config.json, log.jsonl, episodes.csv, curve.png, evaluation.json
+    tunnel: Path | None = None  # tunnel file or name, its sleepers laid by standard; `subterra-351` if left out
+    scene: Path | None = None  # built scene folder, whose own sleepers are walked on; instead of a tunnel
+    preset: str | None = None  # `cpu` or `gpu`; what jax runs on if left out
+    # train these seeds, one after the other, into `out/seed-<k>`; one run of `--seed` if left out
     seeds: tuple[int, ...] = ()
+    # Go on from the newest checkpoint in `out`; from the beginning where there is none yet. Only the limits on
+    # training may differ.
     resume: bool = False
-    overwrite: bool = False
-    robots: int = 1000
-    release: Path | None = None
+    overwrite: bool = False  # throw away the run that `out` holds
+    robots: int = 1000  # robots of the evaluation after training, an episode of 20 s each
+    release: Path | None = None  # write the policy of the last seed there, a `.safetensors` file
+    # YAML, TOML or JSON file with options, or a run's `config.json`; options override it
     settings: Annotated[Path | None, tyro.conf.arg(name="config")] = None
+    # further places to log to
     logs: Annotated[Logs, tyro.conf.OmitArgPrefixes] = dataclasses.field(default_factory=Logs)
+    # settings of PPO
     config: Annotated[WalkConfig, tyro.conf.OmitArgPrefixes] = dataclasses.field(default_factory=WalkConfig)
 
 

@@ -29,13 +29,9 @@ class Forgetful(Memory):
 
 @struct.dataclass
 class Lacking(Learnt):
-    """A policy that lacks something that `act` and `begin` are given.
+    """A policy that lacks something that `act` and `begin` are given."""
 
-    Attributes:
-        lacks: What it lacks.
-    """
-
-    lacks: Part = struct.field(pytree_node=False, default="walls")
+    lacks: Part = struct.field(pytree_node=False, default="walls")  # what it lacks
 
     def begin(self, key: PRNGKeyArray, obs: Observed, params: EnvParams) -> LearntMemory:
         """Begins at the first observation, less what is lacking."""

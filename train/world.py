@@ -25,23 +25,14 @@ _PACKAGES = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
 
 @dataclasses.dataclass(frozen=True)
 class World:
-    """A task on a tunnel.
+    """A task on a tunnel."""
 
-    Attributes:
-        task: Task id.
-        env: The environment.
-        params: Its parameters.
-        facts: Task, lining, and the tunnel file's name, provenance and SHA-256: the identity of the world.
-        unchanged: Its params before `with_reward`; None where nothing was changed.
-        val: World of the evaluation after training; None is this one.
-    """
-
-    task: str
-    env: Any
-    params: Any
-    facts: dict[str, Any]
-    unchanged: Any = None
-    val: "World | None" = None
+    task: str  # task id
+    env: Any  # the environment
+    params: Any  # its parameters
+    facts: dict[str, Any]  # task, lining, and the tunnel file's name, provenance and SHA-256: the identity of the world
+    unchanged: Any = None  # its params before `with_reward`; None where nothing was changed
+    val: "World | None" = None  # world of the evaluation after training; None is this one
 
     def scored(self) -> "World":
         """Returns the world of the evaluation after training."""

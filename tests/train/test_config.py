@@ -19,6 +19,7 @@ WRONG = {
     "init_std": 0.0,
     "discount": 1.5,
     "gae_lambda": -0.1,
+    "last_std": 0.0,
     "clip": float("nan"),
     "entropy_weight": -1.0,
 }

@@ -35,10 +35,13 @@ def world(tmp_path_factory):
 
 def test_a_policy_learns_to_stop_at_its_goal_and_drives_as_it_was_trained(world):
     """Advantages of the wrong sign, or a start that training reads 40 m off, leave it below a tenth."""
-    config = TrainConfig(steps=250_000, n_envs=64, unroll=32, hidden=(32, 32), learning_rate=1e-3, discount=0.99)
+    config = TrainConfig(
+        steps=250_000, n_envs=64, unroll=32, hidden=(32, 32), learning_rate=1e-3, discount=0.99, last_std=0.1
+    )
     learner = make_learner(world, config)
     last = train(learner, world.params)
     assert evaluate(world, make_agent(learner.driver, last.policy), 100)["success"] >= LEAST
+    np.testing.assert_array_less(np.exp(last.state.student.weights["log_std"]), 0.1001)
 
 
 @dataclasses.dataclass(frozen=True)

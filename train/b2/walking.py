@@ -76,13 +76,9 @@ def make_walk_config(preset: str) -> WalkConfig:
 
 @dataclasses.dataclass(frozen=True)
 class WalkLayout:
-    """Sizes of the walking robot's network.
+    """Sizes of the walking robot's network."""
 
-    Attributes:
-        shape: Of the network: the actor sees the first `n_seen` numbers of the observation, the critic all.
-    """
-
-    shape: Shape
+    shape: Shape  # Of the network: the actor sees the first `n_seen` numbers of the observation, the critic all
 
     def to_json(self) -> dict[str, Any]:
         """Returns the layout as a policy's file holds it."""
