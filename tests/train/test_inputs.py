@@ -10,8 +10,10 @@ import pytest
 import subterra_jax as st
 from subterra_jax import policies
 from subterra_jax.baselines.agent import observed
+from subterra_jax.baselines.stations import OdometerCount
 from subterra_jax.policies import inputs
-from subterra_jax.policies.memories import Given
+from subterra_jax.policies.memories import Given, Memory
+from subterra_jax.rules import GoalParams
 from train.config import TrainConfig
 from train.driver import Driver, Policy
 from train.policies import begin_with, make_agent
@@ -118,7 +120,29 @@ def test_after_the_flag_the_way_leads_back_to_the_start(plan):
     now = inputs.see(now, back)
     assert float(inputs.way_to_go(now, back, params)) == pytest.approx(out - reach - 10.0, abs=1e-3)
     bent = dataclasses.replace(back, heading=obs.heading + 1.0)
-    assert now.turned and inputs.see(now, bent).turned  # wherever the tunnel bends on the way back
+    assert now.turned
+    assert inputs.see(now, bent).turned  # wherever the tunnel bends on the way back
+
+
+def test_a_localiser_counts_the_way_back_from_where_the_robot_has_turned(tunnel, monkeypatch):
+    """Walls that are found anew while the robot is still askew count a metre as less."""
+    monkeypatch.setattr(Given, "localiser", lambda given, params: OdometerCount())
+    env, params = st.make("Subterra/Return-v1", tunnel=str(tunnel), goal=GoalParams(low=4.0, high=8.0, margin=4.0))
+    memory, flag = Memory("along"), jnp.float32(1.0)
+
+    @jax.jit
+    def step(state, kept, command, key):
+        flat, state, *_ = env.step(key, state, command, params)
+        obs = dataclasses.replace(observed(env, params, flat), flag=flag)
+        return state, memory.take(kept, command, obs, params, Given())
+
+    flat, state = env.reset(jax.random.key(0), params)
+    kept = memory.begin(observed(env, params, flat), params, Given())
+    around = [jnp.array([0.0, 1.5])] * 16 + [jnp.array([1.0, 1.5])] * 5  # the last third of the turn while it drives
+    for k, command in enumerate([jnp.array([1.0, 0.0])] * 10 + around + [jnp.array([1.0, 0.0])] * 20):
+        state, kept = step(state, kept, command, jax.random.key(k))
+    assert kept.located.direction == -1.0
+    assert float(kept.located.station.station - state.station) == pytest.approx(0.0, abs=0.25)
 
 
 def test_a_filter_on_the_map_reports_what_it_believes_in_training_as_in_driving():
