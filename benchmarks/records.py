@@ -2,7 +2,8 @@
 
 `python -m benchmarks.records render` writes the tables of all pages anew; `check` fails where a
 record is missing or a page is stale; `keep out/board/records.json` takes records over into
-`benchmarks/results/`, a file for each family (the first word of an id).
+`benchmarks/results/`, a file for each family (the first word of an id); `compare` says which
+figures of such files differ from those on record.
 
 A record is one figure. Commands write theirs to `records.json` beside their other results. A page
 holds a table's template in a comment, with ids in braces, and the rendered table behind it. A line
@@ -46,7 +47,9 @@ class Record:
     versions: dict[str, str]  # Versions of Python and packages
     date: str  # Day of the measurement
     command: str  # Words after `python -m`
-    commit: str  # Commit that was measured; `unknown` where it was not kept, as before 26 November 2026
+    # Commit that was measured; `unknown` where it was not kept, as before 26 November 2026; `until X` where the program
+    # of the command is no part of the tree after commit X
+    commit: str
     # Whether a measurement again must be near it, or may be larger (`at least`) or smaller (`at most`)
     bound: Literal["near", "at least", "at most"] = "near"
     tolerance: float = 0.0  # Difference in the wrong direction that is none, in its unit
@@ -155,6 +158,17 @@ def keep(paths: Sequence[Path], folder: Path = FOLDER) -> None:
             print(file)
 
 
+def compare(paths: Sequence[Path], folder: Path = FOLDER) -> int:
+    """Print measured figures beside those on record; return 1 where one differs."""
+    records, status = on_record(folder), 0
+    for record in (record for path in paths for record in read_records(path)):
+        if (known := records.get(record.id)) is not None:
+            same = known.holds(record.value)
+            status |= not same
+            print(f"{record.id}: {known.text} on record, {record.text} now: {'same' if same else 'differs'}")
+    return status
+
+
 def rendered(text: str, records: dict[str, Record], page: str) -> str:
     """Return a page with its tables rendered from records.
 
@@ -218,12 +232,13 @@ def render(write: bool) -> int:
 
 
 def main(words: list[str] | None = None) -> int:
-    """Runs the command line: `render`, `check`, or `keep FILE…`; returns 2 for a user's mistake."""
+    """Runs the command line: `render`, `check`, `keep FILE…` or `compare FILE…`; returns 2 for a user's mistake."""
     command, *rest = (sys.argv[1:] if words is None else words) or [""]
     commands: dict[str, Callable[[], int | None]] = {
         "render": lambda: render(write=True),
         "check": lambda: render(write=False),
         "keep": lambda: keep([Path(word) for word in rest]),
+        "compare": lambda: compare([Path(word) for word in rest]),
     }
     if command in ("-h", "--help"):
         print(__doc__)

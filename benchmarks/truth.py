@@ -1,6 +1,7 @@
 """Compares a reconstructed bore with the exact truth of a simulated survey; nothing is fitted or scaled first."""
 
 import json
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -94,3 +95,33 @@ def compare(scene: Path, truth: Truth) -> Comparison:
         size["height"](at) - truth.height[inside],
         float(station[-1] - (truth.station[-1] - truth.station[0])),
     )
+
+
+REACH = 0.15  # m, largest distance between a feature and its match
+
+
+def sleepers_of(scene: Path) -> Float[np.ndarray, "n 3"]:
+    """Returns the middles of the sleepers in `scene.xml`, m."""
+    geoms = re.findall(r'<geom[^>]*name="sleeper_[^>]*>', (scene / "scene.xml").read_text())
+    places = [re.search(r'pos="([^"]*)"', geom) for geom in geoms]
+    return np.array([place[1].split() for place in places if place], float).reshape(-1, 3)
+
+
+def f1(hits: int, built: int, true: int) -> float:
+    """Returns the harmonic mean of precision and recall; 1 where there is nothing and nothing was found."""
+    return 2 * hits / (built + true) if built + true else 1.0
+
+
+def one_to_one(built: Float[np.ndarray, "n d"], true: Float[np.ndarray, "m d"]) -> tuple[np.ndarray, np.ndarray]:
+    """Matches features within `REACH`, each at most once, nearest pairs first; returns the indices of both."""
+    if not len(built) or not len(true):
+        return np.empty(0, int), np.empty(0, int)
+    near = cKDTree(built).sparse_distance_matrix(cKDTree(true), REACH, output_type="coo_matrix")
+    order = np.argsort(near.data, kind="stable")
+    free_built, free_true, pairs = np.ones(len(built), bool), np.ones(len(true), bool), []
+    for i, j in zip(near.row[order], near.col[order], strict=True):
+        if free_built[i] and free_true[j]:
+            free_built[i] = free_true[j] = False
+            pairs.append((i, j))
+    matched = np.array(pairs, int).reshape(-1, 2)
+    return matched[:, 0], matched[:, 1]

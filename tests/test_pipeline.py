@@ -11,7 +11,7 @@ import pytest
 import trimesh
 
 import subterra_jax as st
-from benchmarks.rays import planar as reference
+from benchmarks import reference
 from scene.build import build
 from scene.config import BuildConfig, ReconstructConfig
 from scene.fitting.lining import LiningConfig

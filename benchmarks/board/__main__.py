@@ -13,7 +13,7 @@ import sys
 from benchmarks.board import picture, tables
 from benchmarks.board.cells import read_cells
 from benchmarks.board.drive import BoardConfig, check, choose_by_rule, conditions_of_parts, drive, is_there, jobs_of
-from benchmarks.board.records import records_of
+from benchmarks.board.tables import records_of
 from benchmarks.command import run_main
 from benchmarks.records import write_records
 from benchmarks.results import png_bytes, write_file

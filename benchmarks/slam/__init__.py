@@ -1,4 +1,4 @@
 """SLAM programs on recorded episodes.
 
-recordings (sets, sweeps) ─► run (libraries of today, wheel odometry) ─► tracks (TUM files, axis) ─► score
+arena (drives as bags) ─► board (programs of today, wheel odometry) ─► tracks (TUM files, axis) ─► score
 """

@@ -1,6 +1,6 @@
 """Recordings for SLAM programs, and scores of their poses.
 
-Example: python -m benchmarks.slam record --scene build/tunnel --out out/slam/set
+Example: python -m benchmarks.slam arena --out out/arena
 """
 
 import json
@@ -18,22 +18,14 @@ from benchmarks.results import environment_facts, png_bytes, write_file
 from benchmarks.slam import board_page, score_page
 from benchmarks.slam.arena.sets import ArenaConfig, make_arena
 from benchmarks.slam.board import BoardConfig, make_board
-from benchmarks.slam.recordings import SetConfig, make_set
-from benchmarks.slam.run import RunConfig, run_all
 from benchmarks.slam.score import ProgramScore, ScoreConfig, score_all
 from benchmarks.slam.submission import SubmissionConfig, check_submission
 
 _progress = Console(stderr=True, highlight=False)
 _PROG = "python -m benchmarks.slam"
-_RECORD = f"""Record listed episodes, with the truth kept apart.
-
-Example: {_PROG} record --scene build/tunnel --linings smooth pockets --out out/slam/set"""
 _ARENA = f"""Record the arena: drives for LiDAR-inertial programs, from smooth walls to rough ones.
 
 Example: {_PROG} arena --out out/arena"""
-_RUN = f"""Run a SLAM program on recordings.
-
-Example: {_PROG} run --library kiss-icp --recordings out/slam/set --out out/slam/kiss-icp"""
 _BOARD = f"""Run and score every program on sets of the arena.
 
 Example: {_PROG} board --sets out/arena --out out/board --jobs 2"""
@@ -42,32 +34,29 @@ _CHECK = f"""Check that a submission can be scored, without the truth.
 Example: {_PROG} check --submission mine --recordings out/arena"""
 _SCORE = f"""Score TUM files against the truth.
 
-Example: {_PROG} score --estimate out/slam/kiss-icp --truth out/slam/set/truth --out out/slam/scores"""
+Example: {_PROG} score --estimate out/board/poses/arena/evalio-kiss --truth out/arena/truth --out out/scores"""
 
 Command = (
-    Annotated[SetConfig, tyro.conf.subcommand("record", description=_RECORD)]
-    | Annotated[ArenaConfig, tyro.conf.subcommand("arena", description=_ARENA)]
-    | Annotated[RunConfig, tyro.conf.subcommand("run", description=_RUN)]
+    Annotated[ArenaConfig, tyro.conf.subcommand("arena", description=_ARENA)]
     | Annotated[BoardConfig, tyro.conf.subcommand("board", description=_BOARD)]
     | Annotated[SubmissionConfig, tyro.conf.subcommand("check", description=_CHECK)]
     | Annotated[ScoreConfig, tyro.conf.subcommand("score", description=_SCORE)]
 )
 
 
-def main(config: SetConfig | ArenaConfig | RunConfig | BoardConfig | SubmissionConfig | ScoreConfig) -> None:
+def main(config: ArenaConfig | BoardConfig | SubmissionConfig | ScoreConfig) -> None:
     """Records, runs, checks or scores.
 
     Raises:
         SubterraError: An input is missing or wrong, or an output cannot be written.
     """
-    if isinstance(config, SetConfig | ArenaConfig):
-        for name, existed in make_set(config) if isinstance(config, SetConfig) else make_arena(config):
+    if isinstance(config, ArenaConfig):
+        for name, existed in make_arena(config):
             _progress.print(f"{name}: {'there already' if existed else 'recorded'}")
-    elif isinstance(config, RunConfig | BoardConfig):
-        for name, result in run_all(config) if isinstance(config, RunConfig) else make_board(config):
+    elif isinstance(config, BoardConfig):
+        for name, result in make_board(config):
             _progress.print(f"{name}: {result}")
-        if isinstance(config, BoardConfig):
-            _write_board(config.out)
+        _write_board(config.out)
     elif isinstance(config, SubmissionConfig):
         print("\n".join(check_submission(config)))
     else:

@@ -1,6 +1,10 @@
-"""The arena's board: every program on every recording of some sets, scored."""
+"""The arena's board: every program on every recording of some sets, each in a process of its own, scored."""
 
 import json
+import os
+import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
@@ -12,14 +16,93 @@ from benchmarks.command import BenchmarkError, require_least
 from benchmarks.results import environment_facts, write_file
 from benchmarks.slam.arena.bound import find_floor
 from benchmarks.slam.arena.sets import redraw
-from benchmarks.slam.programs import ARENA, WHEELS, find_program
-from benchmarks.slam.reading import check_recording, recordings_in
-from benchmarks.slam.run import Case, describe, run_case
+from benchmarks.slam.programs import PROGRAMS, WHEELS, find_program
+from benchmarks.slam.reading import ODOMETRY, TRUTH, TRUTH_FILE, check_recording, recordings_in
 from benchmarks.slam.score import LEAST_COVERED, score_files
+from subterra_jax.host.files import replace_file
 
 SCHEMA = "subterra.arena-board/2"
 _SLOWEST = ("evalio-form", "evalio-genz", "evalio-ct")
+_ALONE = "import sys; from benchmarks.slam.programs import main; sys.exit(main(sys.argv[1:]))"
+_SAYS = '{"poses"'  # beginning of the line in which the process reports
 _KEPT = ("distance", "covered", "drift", "along_final", "along_rms", "across_rms", "up_rms", "reach")
+
+
+@dataclass(frozen=True)
+class Case:
+    """One program on one recording."""
+
+    program: str  # Name of the program
+    recording: Path  # Folder of the recording
+    place: Path  # Folder of the poses and facts
+
+    @property
+    def name(self) -> str:
+        return self.recording.name
+
+    @property
+    def facts(self) -> Path:
+        """File of what is known of the run."""
+        return self.place / f"{self.name}.json"
+
+    @property
+    def poses(self) -> Path:
+        """File of the estimated poses; missing where the program failed."""
+        return self.place / f"{self.name}.tum"
+
+    @property
+    def truth(self) -> Path:
+        """File of the true poses."""
+        return self.recording.parent.parent / TRUTH / self.name / TRUTH_FILE
+
+
+def run_case(case: Case, limit: float) -> dict[str, Any]:
+    """Runs a case unless its facts are there, for `limit` s at most.
+
+    Returns:
+        `seconds` that the program took, `share` of the recording's duration, `poses`, or `failed` with the reason;
+        `version`, `date` and `machine`.
+    """
+    if case.facts.is_file():
+        return json.loads(case.facts.read_text())
+    case.place.mkdir(parents=True, exist_ok=True)
+    result: dict[str, Any] = {}
+    if case.program == WHEELS:
+        with replace_file(case.poses) as fresh:
+            shutil.copyfile(case.recording / "recording" / ODOMETRY, fresh)
+    else:
+        result = _run_alone(case, limit)
+    facts = environment_facts()
+    result |= {"version": find_program(case.program), "date": facts["date"]}
+    result["machine"] = f"{facts['cpu_cores']} cores, {facts['processor']}"
+    write_file(case.facts, (json.dumps(result) + "\n").encode())
+    return result
+
+
+def _run_alone(case: Case, limit: float) -> dict[str, Any]:
+    """Runs a program in a process of its own: one that crashes takes no other with it."""
+    words = [sys.executable, "-c", _ALONE, case.program]
+    paths = [str(case.recording.resolve()), str(case.poses.resolve())]
+    path = os.pathsep.join(filter(None, [str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")]))
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": path}
+    try:
+        done = subprocess.run([*words, *paths], capture_output=True, text=True, timeout=limit, env=environment)
+    except subprocess.TimeoutExpired:
+        return {"failed": f"did not finish within {limit:g} s"}
+    if done.returncode:
+        last = done.stderr.strip().splitlines()[-1:] or [f"ended with status {done.returncode}"]
+        return {"failed": last[0] if done.returncode > 0 else f"crashed with signal {-done.returncode}: {last[0]}"}
+    said = [line for line in done.stdout.splitlines() if line.startswith(_SAYS)]  # libraries print too
+    return json.loads(said[-1])
+
+
+def describe(result: dict[str, Any]) -> str:
+    """Returns a line about a run."""
+    if "failed" in result:
+        return f"failed: {result['failed']}"
+    if "poses" not in result:
+        return "copied"
+    return f"{result['poses']} poses in {result['seconds']:.0f} s, {100.0 * result['share']:.0f} % of real time"
 
 
 @dataclass(frozen=True)
@@ -28,7 +111,7 @@ class BoardConfig:
 
     out: Path  # Folder for poses, `board.json`, `board.md`, `board.png` and `records.json`.
     sets: tuple[Path, ...] = ()  # Sets of the arena with their truth, one for each seed.
-    programs: tuple[str, ...] = (WHEELS, *ARENA)  # Programs to run; by default all, the odometer included.
+    programs: tuple[str, ...] = (WHEELS, *PROGRAMS)  # Programs to run; by default all, the odometer included.
     jobs: int = 1  # Programs run at a time.
     limit: float = 1800.0  # Time after which a program counts as failed on a recording, s.
     # Run what is missing; otherwise only poses that are in `out` already are scored, and no bag is needed.
@@ -48,10 +131,7 @@ def plan_board(config: BoardConfig) -> list[Case]:
     if len({folder.name for folder in config.sets}) < len(config.sets):
         raise BenchmarkError("sets must differ in the last part of their names")
     for name in config.programs:
-        if name not in (WHEELS, *ARENA):
-            raise BenchmarkError(f"no program {name!r}; there are {', '.join([WHEELS, *ARENA])}")
-        if config.run:
-            find_program(name)
+        find_program(name, installed=config.run)
     cases = []
     for folder in config.sets:
         for recording in recordings_in(folder):

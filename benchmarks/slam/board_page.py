@@ -77,7 +77,7 @@ def records_of(board: dict[str, Any]) -> list[Record]:
         for program in _programs(board):
             if (drift := median_drift(board["rows"], program, recording)) is not None:
                 middle, low, high = (round(value, 2) for value in drift)
-                command = f"benchmarks.slam run --library {program} --recordings out/arena --out out/slam/{program}"
+                command = f"benchmarks.slam board --sets out/arena --programs {program} --out out/slam/board"
                 found.append(Record(f"arena/{program}/{name}", middle, "%", (low, high), command=command, **facts))
         command = "benchmarks.slam board --sets out/arena --out out/slam/board"
         floor = round(_floor(board, recording), 4)

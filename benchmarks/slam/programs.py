@@ -1,4 +1,4 @@
-"""Programs for SLAM, with their own defaults and one thread: `evalio`'s, `rko-lio`, KISS-ICP, GenZ-ICP, our trackers.
+"""Programs for SLAM, with their own defaults and one thread: `evalio`'s and `rko-lio`.
 
 `main` runs one in this process: it reads the bag, feeds sweeps and IMU samples in order, writes the LiDAR's poses and
 prints one line of JSON. The libraries are optional (`pip install 'subterra-jax[slam]'`).
@@ -7,34 +7,21 @@ prints one line of JSON. The libraries are optional (`pip install 'subterra-jax[
 import json
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import partial
-from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
-from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from benchmarks.command import BenchmarkError
-from benchmarks.slam.reading import (
-    CALIBRATION,
-    CLOUDS,
-    PLANAR,
-    Poses,
-    Sweep,
-    read_clouds,
-    read_planar,
-    read_samples,
-)
+from benchmarks.slam.reading import CALIBRATION, Poses, read_samples
 from scene.poses.trajectory import Trajectory, save_tum
 
-Step = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "4 4"]]
 WHEELS = "wheel-odometry"
-_PLANAR_VOXEL = 0.3  # m: planar scans reach 30 m where the clouds reach 100 m
 # What is not left at a program's defaults: sums of several threads differ from run to run; points are undistorted by
 # their times, which evalio leaves out; no sweep is skipped to keep up with real time.
 _CHANGES = {"max_num_threads": 1, "num_threads": 1, "ls_num_threads": 1, "numberOfCores": 1, "deskew": True,
@@ -45,48 +32,7 @@ class Program(NamedTuple):
     """A program that gives poses."""
 
     package: str  # Package that it comes with
-    run: Callable[[Path], Poses]  # Runs it on the folder of a recording
-    topic: str = ""  # Topic of the bag that it reads; empty where it reads recordings of the arena
-
-
-def make_kiss(voxel: float | None, max_range: float) -> Step:
-    """Starts KISS-ICP: a function from a sweep's points, m, to the pose of the sensor."""
-    made = import_module("kiss_icp.config").KISSConfig()
-    made.data.max_range, made.data.deskew = max_range, False
-    made.mapping.voxel_size = max_range / 100.0 if voxel is None else voxel
-    made.registration.max_num_threads = 1
-    return _stepping(import_module("kiss_icp.kiss_icp").KissICP(made), np.zeros_like)
-
-
-def make_genz() -> Step:
-    """Starts GenZ-ICP: a function from a sweep's points, m, to the pose of the sensor."""
-    made = import_module("genz_icp.config").GenZConfig()
-    made.registration.max_num_threads = 1
-    return _stepping(import_module("genz_icp.genz_icp").GenZICP(made), lambda column: np.zeros(0))
-
-
-def _stepping(odometry: Any, times: Callable[[np.ndarray], np.ndarray]) -> Step:
-    def step(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "4 4"]:
-        odometry.register_frame(points, times(points[:, 0]))
-        return np.array(odometry.last_pose)
-
-    return step
-
-
-def estimate_poses(step: Step, sweeps: Iterable[Sweep]) -> Poses:
-    """Feeds sweeps to an odometry; its poses are in the frame of the first one.
-
-    Raises:
-        BenchmarkError: A sweep holds no point.
-    """
-    times: list[float] = []
-    poses, started = [], time.perf_counter()
-    for stamp, points in sweeps:
-        if not len(points):
-            raise BenchmarkError(f"sweep {len(times)} holds no point")
-        times.append(stamp)
-        poses.append(step(np.ascontiguousarray(points, np.float64)))
-    return np.array(times), np.array(poses).reshape(-1, 4, 4), time.perf_counter() - started
+    run: Callable[[Path], Poses]  # Runs it on the folder of a recording of the arena
 
 
 def _run_evalio(name: str, recording: Path) -> Poses:
@@ -134,28 +80,15 @@ def _run_rko(recording: Path) -> Poses:
     return np.array([t for t, _ in rows]), np.array([pose for _, pose in rows]), seconds
 
 
-def _run_tracker(name: str, recording: Path) -> Poses:
-    from benchmarks.slam.trackers import run_tracker
-
-    return run_tracker(name, recording)
-
-
 PROGRAMS = {
     **{f"evalio-{name}": Program("evalio", partial(_run_evalio, name))
        for name in ("kiss", "genz", "mad", "ct", "loam", "liosam", "dlio", "form")},
     "rko-lio": Program("rko-lio", _run_rko),
-    **{name: Program("jax", partial(_run_tracker, name)) for name in ("ring-filter", "particle-filter")},
-    "kiss-icp": Program("kiss-icp", lambda at: estimate_poses(make_kiss(None, 100.0), read_clouds(at)), CLOUDS),
-    "genz-icp": Program("genz-icp", lambda at: estimate_poses(make_genz(), read_clouds(at)), CLOUDS),
-    "kiss-icp-planar": Program(
-        "kiss-icp", lambda at: estimate_poses(make_kiss(_PLANAR_VOXEL, 30.0), read_planar(at)), PLANAR
-    ),
 }  # fmt: skip
-ARENA = tuple(name for name, program in PROGRAMS.items() if not program.topic)
 
 
-def find_program(name: str) -> str:
-    """Returns the version of a program's package; empty for the robot's own odometry.
+def find_program(name: str, installed: bool = True) -> str:
+    """Returns the version of a program's package; empty for the robot's own odometry, and where it need not be there.
 
     Raises:
         BenchmarkError: There is no such program, or it is not installed.
@@ -168,6 +101,8 @@ def find_program(name: str) -> str:
     try:
         return version(package)
     except PackageNotFoundError as error:
+        if not installed:
+            return ""
         raise BenchmarkError(f"{name} needs {package}, which is not installed: pip install {package}") from error
 
 

@@ -10,17 +10,13 @@ import yaml
 from jaxtyping import Float
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
-from rosbags.typesys import Stores, get_typestore
 
 from benchmarks.command import BenchmarkError
-from scene.reading.scans import parse_pointcloud2
 
 RECORDINGS, TRUTH, INDEX = "recordings", "truth", "set.json"  # folders and file of a set
 CALIBRATION, TRUTH_FILE, ODOMETRY = "calibration.yaml", "lidar.tum", "odometry.tum"
-CLOUDS, PLANAR = "/points", "/scan_dense"  # topics of recorded episodes
 
 Poses = tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 4 4"], float]  # times, s; LiDAR poses; run time, s
-Sweep = tuple[float, Float[np.ndarray, "n 3"]]  # stamp, s; points in the sensor's frame, m
 # One layout for all drivers: m, reflectivity or intensity as reported, ns after the header's stamp, line.
 POINT = np.dtype([
     ("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("t", "<u4"), ("ring", "<u2"),
@@ -43,18 +39,8 @@ def recordings_in(folder: Path) -> list[Path]:
     inside = folder / RECORDINGS if (folder / RECORDINGS).is_dir() else folder
     bags = sorted(path for path in inside.glob("*/recording") if path.is_dir()) if inside.is_dir() else []
     if not bags:
-        raise BenchmarkError(f"{folder}: holds no recordings (`python -m benchmarks.slam record` makes some)")
+        raise BenchmarkError(f"{folder}: holds no recordings (`python -m benchmarks.slam arena` makes some)")
     return [bag.parent for bag in bags]
-
-
-def count_messages(recording: Path) -> dict[str, int]:
-    """Returns the number of messages of each topic of a recording.
-
-    Raises:
-        BenchmarkError: It holds no bag or a damaged one.
-    """
-    with closing(_open_bag(recording / "recording")) as reader:
-        return {connection.topic: connection.msgcount for connection in reader.connections}
 
 
 def check_recording(recording: Path) -> None:
@@ -63,7 +49,9 @@ def check_recording(recording: Path) -> None:
     Raises:
         BenchmarkError: A file is missing or damaged, or the bag lacks a topic.
     """
-    held, path = count_messages(recording), recording / CALIBRATION
+    path = recording / CALIBRATION
+    with closing(_open_bag(recording / "recording")) as reader:
+        held = {connection.topic: connection.msgcount for connection in reader.connections}
     try:
         facts = yaml.safe_load(path.read_text())
         topics = [facts[part]["topic"] for part in ("lidar", "imu")]
@@ -74,42 +62,6 @@ def check_recording(recording: Path) -> None:
     for topic in topics:
         if not held.get(topic):
             raise BenchmarkError(f"{recording / 'recording'}: has no topic {topic}; it has {', '.join(sorted(held))}")
-
-
-def read_clouds(recording: Path, topic: str = CLOUDS) -> Iterator[Sweep]:
-    """Reads the sweeps of the 3-D LiDAR of a recorded episode.
-
-    Raises:
-        BenchmarkError: There is no bag, a damaged one, or one without this topic.
-    """
-    for message in _messages(recording, topic):
-        scan = parse_pointcloud2(message, _stamp(message))
-        yield scan.stamp, np.asarray(scan.points, np.float64)
-
-
-def read_planar(recording: Path, topic: str = PLANAR) -> Iterator[Sweep]:
-    """Reads planar scans as points at height 0; beams that hit nothing are left out.
-
-    Raises:
-        BenchmarkError: As for `read_clouds`.
-    """
-    for message in _messages(recording, topic):
-        ranges = np.asarray(message.ranges, np.float64)
-        bearing = message.angle_min + message.angle_increment * np.arange(len(ranges))
-        hit = (ranges >= message.range_min) & (ranges < message.range_max)
-        level = ranges[hit, None] * np.column_stack([np.cos(bearing[hit]), np.sin(bearing[hit])])
-        yield _stamp(message), np.column_stack([level, np.zeros(len(level))])
-
-
-def _messages(recording: Path, topic: str) -> Iterator[Any]:
-    types = get_typestore(Stores.ROS2_JAZZY)
-    with closing(_open_bag(recording / "recording")) as reader:
-        some = [connection for connection in reader.connections if connection.topic == topic]
-        if not some:
-            held = ", ".join(sorted(connection.topic for connection in reader.connections))
-            raise BenchmarkError(f"{recording}: has no topic {topic}; it has {held}")
-        for connection, _, raw in reader.messages(connections=some):
-            yield types.deserialize_cdr(raw, connection.msgtype)
 
 
 def _open_bag(folder: Path) -> Any:
@@ -123,10 +75,6 @@ def _open_bag(folder: Path) -> Any:
     except Exception as error:  # the library raises many kinds of errors for a damaged file
         raise BenchmarkError(f"{folder}: not a whole recording ({error})") from error
     return reader
-
-
-def _stamp(message: Any) -> float:
-    return float(message.header.stamp.sec + message.header.stamp.nanosec * 1e-9)
 
 
 def sweep_points(message: Any) -> np.ndarray:

@@ -1,6 +1,6 @@
 """Speed of the batched environment and of its peers, measured together with the exactness of its LiDAR.
 
-`python -m benchmarks.throughput --n 1024 4096 --lengths 351 3510 --linings smooth pockets furnished --out out/speed`
+`python -m benchmarks.throughput --n 1024 4096 --out out/speed`
 `python -m benchmarks.throughput --task Subterra/StopAt-v1 --tunnel open:train:0-999 --sensor spin16x64 --n 65536`
 """
 
@@ -13,14 +13,12 @@ from rich.console import Console
 import subterra_jax as st
 from benchmarks.command import BenchmarkError, run_main
 from benchmarks.records import write_records
+from benchmarks.reference import measure_exactness, measure_exactness_of_many
 from benchmarks.results import environment_facts, write_file
 from benchmarks.throughput import report
 from benchmarks.throughput.config import ThroughputConfig, check
-from benchmarks.throughput.figures import records_of
-from benchmarks.throughput.measure import environment_loop, floor_loop, measure_exactness, measure_exactness_of_many
-from benchmarks.throughput.peers import measure_jaxnav, require_jaxnav
+from benchmarks.throughput.loops import environment_loop, measure_jaxnav, require_jaxnav
 from benchmarks.throughput.timing import Timing, measure
-from benchmarks.throughput.variants import measure_lengths, measure_linings
 from subterra_jax.host.files import require_folder
 from subterra_jax.tasks import first_tunnel
 from train import tunnels
@@ -46,14 +44,12 @@ def run(config: ThroughputConfig) -> report.Result:
 
 
 def run_one(config: ThroughputConfig) -> report.Result:
-    """Measures in one tunnel, beside JaxNav, and as the tunnel gets longer or rougher."""
+    """Measures in one tunnel, beside JaxNav."""
     if config.peers == "jaxnav":
         require_jaxnav()
     plan = st.load_tunnel(config.tunnel or first_tunnel(config.task))
     lining = config.lining or plan.default_lining
     env, params = st.make(config.task, plan, lining, sensor=config.sensor)
-    for name in config.linings:
-        plan.lining(name)
     segments = len(plan.lining(lining).segments)
     facts = {"name": plan.name, "length": plan.length, "lining": lining, "segments": segments}
     result, timing = _begin(config, facts, params)
@@ -65,12 +61,6 @@ def run_one(config: ThroughputConfig) -> report.Result:
     _measure_speeds(result, env, params, timing)
     if config.peers != "none":
         result.peers.append(measure_jaxnav(config.sizes(), timing, _progress.print))
-    if config.lengths:
-        _progress.print("lengths")
-        result.lengths = measure_lengths(config, timing)
-    if config.linings:
-        _progress.print("linings")
-        result.linings = measure_linings(plan, config, timing)
     return result
 
 
@@ -80,10 +70,8 @@ def run_many(config: ThroughputConfig, names: list[Any]) -> report.Result:
     Raises:
         BenchmarkError: Something is asked for that takes one tunnel.
     """
-    asked: dict[str, Any] = {name: getattr(config, name) for name in ("lengths", "linings")}
-    asked["peers"] = config.peers == "jaxnav"
-    for option in (name for name, value in asked.items() if value):
-        raise BenchmarkError(f"--{option} takes one tunnel, and there are {len(names) * config.copies}")
+    if config.peers == "jaxnav":
+        raise BenchmarkError(f"--peers jaxnav takes one tunnel, and there are {len(names) * config.copies}")
     _progress.print(f"{len(names)} tunnels")
     made = tunnels.load(names, config.lining)
     env, params = st.make(config.task, tunnel=made * config.copies, sensor=config.sensor)
@@ -106,17 +94,16 @@ def run_many(config: ThroughputConfig, names: list[Any]) -> report.Result:
 
 def _begin(config: ThroughputConfig, facts: dict[str, Any], params: Any) -> tuple[report.Result, Timing]:
     """Returns the results with nothing measured yet, and how it is timed."""
-    result = report.Result(config, environment_facts(), facts, params.lidar.n_beams)
+    n_beams = params.lidar.n_beams if hasattr(params, "lidar") else 0  # the B2 that walks has no LiDAR
+    result = report.Result(config, environment_facts(), facts, n_beams)
     return result, Timing(config.steps, config.repeats, config.seconds, config.seed)
 
 
 def _measure_speeds(result: report.Result, env: Any, params: Any, timing: Timing) -> None:
-    """Measures each batch size, and the least that a loop of that size does."""
+    """Measures each batch size."""
     for n_envs in result.config.sizes():
         _progress.print(f"subterra: {n_envs:,} environments")
-        loop = environment_loop(env, params, n_envs)
-        result.speeds.append(measure(loop, n_envs, timing))
-        result.floor.append(measure(floor_loop(loop), n_envs, timing))
+        result.speeds.append(measure(environment_loop(env, params, n_envs), n_envs, timing))
 
 
 def run_and_report(config: ThroughputConfig) -> int:
@@ -130,8 +117,8 @@ def run_and_report(config: ThroughputConfig) -> int:
     report.show(result, Console(highlight=False, emoji=False, width=None if sys.stdout.isatty() else 120))
     if config.out is not None:
         write_file(config.out / "throughput.json", report.as_json(result).encode())
-        write_records(config.out / "records.json", records_of(result))
-    if any(gate.n_wrong for gate in result.gates):
+        write_records(config.out / "records.json", report.records_of(result))
+    if result.exactness is not None and result.exactness.n_wrong:
         print("error: the LiDAR disagrees with the reference, so its speed counts for nothing", file=sys.stderr)
         return 1
     return 0

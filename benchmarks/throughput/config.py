@@ -12,8 +12,6 @@ from subterra_jax.parts.spatial_lidar import SENSORS
 
 SIZES = (1, 16, 256, 1024, 4096, 16_384, 65_536, 262_144)
 _MOST_ON_CPU = 4096
-# Batch sizes for comparing lengths and linings: large enough that a step is mostly work, not overhead.
-_STUDY_SIZE_ON_CPU, _STUDY_SIZE = 1024, 65_536
 
 
 @dataclass(frozen=True)
@@ -29,9 +27,6 @@ class ThroughputConfig:
         copies: Copies of each tunnel, in memory of their own.
         lining: Variant of the walls; the tunnel's usual one if not given.
         sensor: LiDAR, the planar one or as `spin16x64`.
-        lengths: Lengths to compare, m, of the first tunnel if it is of the open world, else of a straight one of it.
-        linings: Variants of the walls to compare.
-        study_n: Batch size of those comparisons; 65,536 if not given, on a CPU 1,024.
         steps: Steps in one timed call, all within one `lax.scan`.
         repeats: Timed calls.
         seconds: Time limit for all calls of one size, s; a call gets fewer steps to keep to it.
@@ -47,9 +42,6 @@ class ThroughputConfig:
     copies: int = 1
     lining: str | None = None
     sensor: str = SENSORS[0]
-    lengths: tuple[float, ...] = ()
-    linings: tuple[str, ...] = ()
-    study_n: int | None = None
     steps: int = 100
     repeats: int = 20
     seconds: float = 30.0
@@ -61,13 +53,7 @@ class ThroughputConfig:
         """Returns the batch sizes to measure on this machine, in increasing order."""
         if self.n:
             return tuple(sorted(set(self.n)))
-        return tuple(size for size in SIZES if not _on_cpu() or size <= _MOST_ON_CPU)
-
-    def study_size(self) -> int:
-        """Returns the batch size at which lengths and linings are compared on this machine."""
-        if self.study_n is not None:
-            return self.study_n
-        return _STUDY_SIZE_ON_CPU if _on_cpu() else _STUDY_SIZE
+        return tuple(size for size in SIZES if jax.default_backend() != "cpu" or size <= _MOST_ON_CPU)
 
 
 def check(config: ThroughputConfig) -> None:
@@ -79,13 +65,8 @@ def check(config: ThroughputConfig) -> None:
     for name, least in (("copies", 1), ("steps", 1), ("repeats", 1), ("poses", 0), ("seed", 0)):
         if getattr(config, name) < least:
             raise BenchmarkError(f"--{name} must be at least {least}, got {getattr(config, name)}")
-    for size in (*config.n, config.study_size()):
+    for size in config.n:
         if size < 1:
             raise BenchmarkError(f"a batch holds at least 1 environment, got {size}")
-    for name, value in (("seconds", config.seconds), *(("lengths", length) for length in config.lengths)):
-        if not 0.0 < value < math.inf:
-            raise BenchmarkError(f"--{name} must be positive, got {value}")
-
-
-def _on_cpu() -> bool:
-    return jax.default_backend() == "cpu"
+    if not 0.0 < config.seconds < math.inf:
+        raise BenchmarkError(f"--seconds must be positive, got {config.seconds}")

@@ -1,4 +1,4 @@
-"""One run's results: tables on a terminal, and `throughput.json`."""
+"""One run's results: tables on a terminal, `throughput.json`, and records."""
 
 import dataclasses
 import json
@@ -9,14 +9,14 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.rays.planar import Agreement
+from benchmarks.records import Record, measured
+from benchmarks.reference import Agreement
 from benchmarks.results import constants_facts
 from benchmarks.throughput.config import ThroughputConfig
-from benchmarks.throughput.peers import N_BEAMS, Peer
+from benchmarks.throughput.loops import N_BEAMS, Peer
 from benchmarks.throughput.timing import Speed
-from benchmarks.throughput.variants import Variant
 
-SCHEMA = "subterra.throughput/2"
+SCHEMA = "subterra.throughput/3"
 
 
 @dataclass
@@ -29,16 +29,7 @@ class Result:
     n_beams: int  # Beams of our LiDAR
     exactness: Agreement | None = None  # Comparison of our LiDAR with the reference; `None` if skipped
     speeds: list[Speed] = field(default_factory=list)  # Our speeds, one for each batch size
-    floor: list[Speed] = field(default_factory=list)  # Speeds of the same loop with nothing simulated
     peers: list[Peer] = field(default_factory=list)  # Other environments
-    lengths: list[Variant] = field(default_factory=list)  # Speeds in tunnels of several lengths
-    linings: list[Variant] = field(default_factory=list)  # Speeds in several linings of the tunnel
-
-    @property
-    def gates(self) -> list[Agreement]:
-        """Returns every comparison of the LiDAR with the reference."""
-        every = [self.exactness, *(variant.exactness for variant in (*self.lengths, *self.linings))]
-        return [gate for gate in every if gate is not None]
 
     def ratios(self, peer: Peer) -> dict[int, float]:
         """Returns our median over a peer's by batch size."""
@@ -56,10 +47,7 @@ def as_json(result: Result) -> str:
         "tunnel": result.tunnel,
         "exactness": None if result.exactness is None else dataclasses.asdict(result.exactness),
         "speed": [_speed(speed, result.n_beams) for speed in result.speeds],
-        "floor": [_speed(speed, 0) for speed in result.floor],
         "peers": [_peer(peer, result) for peer in result.peers],
-        "lengths": [_variant(variant, result.n_beams) for variant in result.lengths],
-        "linings": [_variant(variant, result.n_beams) for variant in result.linings],
     }
     return json.dumps(content, indent=2, default=str, allow_nan=False) + "\n"
 
@@ -77,16 +65,8 @@ def _peer(peer: Peer, result: Result) -> dict[str, Any]:
     }
 
 
-def _variant(variant: Variant, n_beams: int) -> dict[str, Any]:
-    q1, median, q3 = variant.cost
-    return dataclasses.asdict(variant) | {
-        "speed": _speed(variant.speed, n_beams),
-        "cost": {"q1": q1, "median": median, "q3": q3},
-    }
-
-
 def show(result: Result, console: Console) -> None:
-    """Prints speeds, ratios, variants and the comparison with the reference."""
+    """Prints speeds, ratios and the comparison with the reference."""
     facts = result.environment
     console.print(
         f"{facts['device']}, {facts['cpu_cores']} cores, jax {facts['jax']}, {facts['date']}; "
@@ -101,9 +81,6 @@ def show(result: Result, console: Console) -> None:
             console.print(f"{peer.name} {peer.version}: {peer.about}", highlight=False)
     if any(peer.speeds for peer in result.peers):
         console.print(_ratios(result))
-    for title, variants in (("length", result.lengths), ("lining", result.linings)):
-        if variants:
-            console.print(_variants(title, variants))
     if result.exactness is not None:
         console.print(gate_line(result.exactness), highlight=False)
 
@@ -120,12 +97,12 @@ def _speeds(result: Result) -> Table:
     table = _table(
         "environment steps", ("who", "envs", "median /s", "quartiles", "ns per step", "rays /s", "compile, s")
     )
-    measured: list[tuple[str, int, Iterable[Speed]]] = [("subterra", result.n_beams, result.speeds)]
-    measured += [(peer.name, N_BEAMS, peer.speeds) for peer in result.peers]
-    for name, n_beams, speeds in [*measured, ("floor", 0, result.floor)]:
+    sources: list[tuple[str, int, Iterable[Speed]]] = [("subterra", result.n_beams, result.speeds)]
+    sources += [(peer.name, N_BEAMS, peer.speeds) for peer in result.peers]
+    for name, n_beams, speeds in sources:
         for speed in speeds:
             _, median, _ = speed.quartiles
-            rays = format_rate(n_beams * median) if n_beams else "-"
+            rays = format_rate(n_beams * median)
             table.add_row(
                 name, f"{speed.n_envs:,}", format_rate(median), _quartiles(speed), f"{1e9 / median:,.1f}", rays,
                 f"{speed.compile_seconds:.1f}",
@@ -141,20 +118,6 @@ def _ratios(result: Result) -> Table:
     for speed in result.speeds:
         cells = [f"{each[speed.n_envs]:,.3g}" if speed.n_envs in each else "-" for each in ratios]
         table.add_row(f"{speed.n_envs:,}", *cells)
-    return table
-
-
-def _variants(title: str, variants: list[Variant]) -> Table:
-    names = (title, "segments", "envs", "median /s", "ns per step", "cost", "quartiles", "error, mm", "wrong")
-    table = _table("cost of a step", names)
-    for variant in variants:
-        lower, median, upper = variant.cost
-        rate, gate = variant.speed.quartiles[1], variant.exactness
-        table.add_row(
-            variant.name, f"{variant.n_segments:,}", f"{variant.speed.n_envs:,}", format_rate(rate),
-            f"{1e9 / rate:,.1f}", f"{median:.3f}", f"{lower:.3f} to {upper:.3f}",
-            *(("-", "-") if gate is None else (f"{gate.max_error * 1e3:.3f}", str(gate.n_wrong))),
-        )  # fmt: skip
     return table
 
 
@@ -176,3 +139,29 @@ def format_rate(value: float) -> str:
         if value >= unit:
             return f"{value / unit:.4g}{suffix}"
     return f"{value:.4g}"
+
+
+def records_of(result: Result) -> list[Record]:
+    """Return the records of a measurement: `speed/cpu-N` or `speed/step-N` in one tunnel, `speed/K-tunnels` in many."""
+    config, many = result.config, result.tunnel.get("tunnels")
+    command = f"benchmarks.throughput {_words(result)}--out out/speed"
+    where = f"{config.task.removeprefix('Subterra/')}, {result.tunnel['name']}"
+    found = []
+    if result.exactness is not None and not many:
+        error, rays = 1e3 * result.exactness.max_error, result.exactness.n_rays
+        found.append(
+            measured("speed/lidar-error", round(error, 2), "mm", command, split=where, n=rays, bound="at most")
+        )
+    for speed in result.speeds:
+        one = f"{'cpu' if result.environment['platform'] == 'cpu' else 'step'}-{speed.n_envs}"
+        name = one if not many else f"{many}-tunnels" + ("" if speed.n_envs == 65_536 else f"-{speed.n_envs}")
+        rate = round(1e-6 * speed.quartiles[1], 3)
+        found.append(measured(f"speed/{name}", rate, "M steps/s", command, split=where, bound="at least"))
+    return found
+
+
+def _words(result: Result) -> str:
+    """Return the options that a measurement again needs."""
+    config = result.config
+    tunnel = f"--tunnel {config.tunnel} --copies {config.copies} " if config.tunnel else ""
+    return f"--task {config.task} {tunnel}--n {' '.join(map(str, config.sizes()))} --poses {config.poses} --peers none "

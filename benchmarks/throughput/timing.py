@@ -4,7 +4,7 @@ Our environment and every JAX peer use the same loop. All outputs of a step are 
 observation, so that the compiler cannot drop a ray and every observation is written to memory.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Any
@@ -63,7 +63,6 @@ class Program:
     n_envs: int  # Environments in the batch
     steps: int  # Steps in one call
     compile_seconds: float  # Time to trace and compile it, s
-    restart: bool  # Start every call from the same state instead of where the last call ended
     _call: Callable[..., Any]
     _params: Any
     _carry: Carry
@@ -82,8 +81,7 @@ class Program:
         elapsed = perf_counter() - started
         if not np.isfinite(float(total)):
             raise FloatingPointError(f"observations or rewards stopped being finite at n_envs={self.n_envs}")
-        if not self.restart:
-            self._carry = carry
+        self._carry = carry
         if keep:
             self._rates.append(self.n_envs * self.steps / elapsed)
             self._done.append(float(done))
@@ -98,42 +96,29 @@ class Program:
 
 def measure(loop: Loop, n_envs: int, timing: Timing) -> Speed:
     """Times one loop."""
-    return measure_in_turn([loop], n_envs, timing)[0]
-
-
-def measure_in_turn(loops: Sequence[Loop], n_envs: int, timing: Timing, restart: bool = False) -> list[Speed]:
-    """Times several loops, one call of each in turn, so that a machine that slows down slows them all.
-
-    Args:
-        loops: Loops to time.
-        n_envs: Environments in each batch.
-        timing: Number and length of calls.
-        restart: Start every call from the state after the reset.
-    """
-    programs = [prepare(loop, n_envs, timing, restart) for loop in loops]
+    program = prepare(loop, n_envs, timing)
     for key in jax.random.split(jax.random.key(timing.seed + 1), timing.repeats):
-        for program in programs:
-            program.call(key)
-    return [program.speed() for program in programs]
+        program.call(key)
+    return program.speed()
 
 
-def prepare(loop: Loop, n_envs: int, timing: Timing, restart: bool = False) -> Program:
+def prepare(loop: Loop, n_envs: int, timing: Timing) -> Program:
     """Compiles a call and runs it once; gives it fewer steps if the calls would take too long."""
     carry = jax.block_until_ready(jax.jit(loop.reset)(jax.random.key(timing.seed), loop.params))
-    program = _compile(loop, n_envs, timing.steps, carry, restart)
+    program = _compile(loop, n_envs, timing.steps, carry)
     elapsed = program.call(jax.random.key(timing.seed), keep=False)
     steps = max(1, min(timing.steps, int(timing.steps * timing.seconds / (timing.repeats * elapsed))))
     # A second compilation is worth its time if it saves a third.
     if steps < 0.7 * timing.steps:
-        program = _compile(loop, n_envs, steps, carry, restart)
+        program = _compile(loop, n_envs, steps, carry)
         program.call(jax.random.key(timing.seed), keep=False)
     return program
 
 
-def _compile(loop: Loop, n_envs: int, steps: int, carry: Carry, restart: bool) -> Program:
+def _compile(loop: Loop, n_envs: int, steps: int, carry: Carry) -> Program:
     started = perf_counter()
     call = jax.jit(_many_steps(loop, steps)).lower(jax.random.key(0), carry, loop.params).compile()
-    return Program(n_envs, steps, perf_counter() - started, restart, call, loop.params, carry)
+    return Program(n_envs, steps, perf_counter() - started, call, loop.params, carry)
 
 
 def _many_steps(loop: Loop, steps: int) -> Callable[..., Any]:

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial import KDTree
 
 import subterra_jax as st
-from benchmarks.rays import planar as reference
+from benchmarks import reference
 from subterra_jax import lidar
 from subterra_jax.parts.unicycle import VehicleParams
 from subterra_jax.tunnel.arrays import ROBOT_RADIUS

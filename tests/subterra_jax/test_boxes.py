@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from benchmarks.rays import planar as reference
+from benchmarks import reference
 from subterra_jax.procedural import open_world
 from subterra_jax.tunnel import Tunnel, blocks, from_centreline
 from subterra_jax.tunnel.distances import distance_to_segment

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from benchmarks.rays import planar as reference
+from benchmarks import reference
 from subterra_jax import lidar
 from subterra_jax.lidar import gpu, nvidia
 from subterra_jax.parts import unicycle

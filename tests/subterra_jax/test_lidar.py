@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks.rays import planar as reference
+from benchmarks import reference
 from subterra_jax import lidar
 from subterra_jax.tunnel import Tunnel
 from subterra_jax.tunnel.plan import TunnelPlan

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from benchmarks.rays import planar as reference
+from benchmarks import reference
 from subterra_jax.evaluation import floor
 from subterra_jax.evaluation.localisability import Solid, localisability, marginal_bound, scan_information
 from subterra_jax.lidar import scan

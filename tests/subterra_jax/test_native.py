@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks.rays import planar as reference
+from benchmarks import reference
 from subterra_jax import lidar, load_tunnel, native
 from subterra_jax.parts import unicycle as vehicle
 from subterra_jax.rows import rowwise

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from benchmarks.rays import planar as reference
+from benchmarks import reference
 from subterra_jax.parts import hashing, obstacles
 from subterra_jax.parts.boxes import Boxes, distance_along
 from subterra_jax.tunnel import Tunnel

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from benchmarks.rays import planar as reference
+from benchmarks import reference
 from subterra_jax.procedural import expand, open_world
 from subterra_jax.procedural.bore import draw_bore
 from subterra_jax.procedural.kinds import KINDS

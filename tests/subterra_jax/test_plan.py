@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from benchmarks.rays import planar as reference
+from benchmarks import reference
 from subterra_jax.tunnel.sources import tunnel_digest
 from tests.subterra_jax import tunnels
 

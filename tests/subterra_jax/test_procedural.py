@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from benchmarks.rays import planar as reference
+from benchmarks import reference
 from subterra_jax.procedural.geometry import Alignment, draw_alignment, wander
 from subterra_jax.procedural.open_world import LINE
 from subterra_jax.tunnel import kept, sources

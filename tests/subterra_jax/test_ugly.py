@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 import subterra_jax as st
-from benchmarks.rays import planar as reference
+from benchmarks import reference
 from subterra_jax import lidar
 from subterra_jax.tunnel import Tunnel
 from subterra_jax.tunnel.tunnel import stack

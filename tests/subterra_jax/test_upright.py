@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from benchmarks.rays import planar as reference
+from benchmarks import reference
 from subterra_jax import lidar, lidar3d
 from subterra_jax.lidar3d import beams
 from subterra_jax.tunnel import Tunnel

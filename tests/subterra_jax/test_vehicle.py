@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks.rays import planar as reference
+from benchmarks import reference
 from subterra_jax.parts import unicycle as vehicle
 from subterra_jax.tunnel import Tunnel, foot
 from subterra_jax.tunnel.sources import load_tunnel

@@ -20,7 +20,6 @@ from benchmarks.slam.arena.drives import CARRIERS
 from benchmarks.slam.arena.record import Course, Scene, SensorName, draw_scene, write_recording, write_truth
 from benchmarks.slam.arena.walls import WALLS
 from benchmarks.slam.reading import INDEX, RECORDINGS, TRUTH
-from benchmarks.slam.recordings import keep_settings
 
 SCHEMA = "subterra.arena/1"
 _DIAL = tuple(Course(f"walls-{name}", name) for name in WALLS)
@@ -85,7 +84,10 @@ def make_arena(config: ArenaConfig) -> Iterator[tuple[str, bool]]:
     """
     plan = plan_arena(config)
     settings = {"schema": SCHEMA, "distance": config.distance, "formats": config.formats, "seed": config.seed}
-    keep_settings(config.out, json.dumps(settings | {"secret": config.secret}, indent=1))
+    kept, content = config.out / TRUTH / INDEX, json.dumps(settings | {"secret": config.secret}, indent=1)
+    if kept.is_file() and kept.read_text() != content:
+        raise BenchmarkError(f"{config.out}: was recorded with other settings; choose another folder")
+    write_file(kept, content.encode())
     missing = [one for one in plan if not (config.out / RECORDINGS / one.name).is_dir()]
     yield from ((one.name, True) for one in plan if one not in missing)
     for name in _record_all(config, missing):

@@ -267,12 +267,10 @@ def test_a_set_is_resumed_and_a_program_keeps_to_furnished_walls_and_loses_smoot
     assert capsys.readouterr().err.count("there already") == 3
     assert command(["arena", "--out", str(tmp_path / "set"), *wanted, "--seed", "1"]) == 2
     assert "was recorded with other settings" in capsys.readouterr().err
-    run = ["run", "--library", "evalio-mad", "--recordings", str(tmp_path / "set"), "--out", str(tmp_path / "mad")]
+    run = ["board", "--programs", "evalio-mad", "--sets", str(tmp_path / "set"), "--out", str(tmp_path / "mad")]
     assert command(run) == 0
-    from benchmarks.slam.score import ScoreConfig, score_all
-
-    scores = score_all(ScoreConfig((tmp_path / "mad",), tmp_path / "set" / "truth"))
-    drift = {one.score.name: one.score.drift for one in scores}
+    rows = json.loads((tmp_path / "mad" / "board.json").read_text())["rows"]
+    drift = {row["recording"]: row["drift"] for row in rows}
     assert drift["walls-furnished"] < 1.0
     assert drift["walls-smooth"] > 50.0
     assert drift["dust-lock"] > 50.0

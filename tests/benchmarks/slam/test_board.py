@@ -88,7 +88,6 @@ def test_half_a_trajectory_is_a_failure(sets, tmp_path):
 
 
 def test_poses_are_scored_without_bags_and_what_was_not_run_is_left_out(sets, tmp_path, monkeypatch):
-    monkeypatch.setattr(board, "ARENA", ("mine",))
     monkeypatch.setitem(programs.PROGRAMS, "mine", programs.Program("no-such-package", lambda at: None))
     for folder in sets:
         for name in ("walls-smooth", "walls-sprayed"):

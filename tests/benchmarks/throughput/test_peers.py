@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from benchmarks.throughput.peers import jaxnav_loop, measure_jaxnav
+from benchmarks.throughput.loops import jaxnav_loop, measure_jaxnav
 from benchmarks.throughput.timing import Loop, Timing
 
 

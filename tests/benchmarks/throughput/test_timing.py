@@ -7,8 +7,8 @@ import pytest
 
 import subterra_jax as st
 from benchmarks.throughput.config import ThroughputConfig
-from benchmarks.throughput.measure import environment_loop, floor_loop
-from benchmarks.throughput.timing import Loop, Timing, digest, measure, measure_in_turn, prepare
+from benchmarks.throughput.loops import environment_loop
+from benchmarks.throughput.timing import Loop, Timing, digest, measure, prepare
 
 
 def counting(first: float = 0.0) -> Loop:
@@ -25,11 +25,6 @@ def test_every_observation_is_in_the_checksum():
     assert speed.checksum == sum(range(4, 9)) + sum(range(8, 13))
     assert speed.share_done == 0.25
     assert len(speed.steps_per_second) == 2
-
-
-def test_a_call_that_restarts_sees_the_same_every_time():
-    speeds = measure_in_turn([counting(), counting(100.0)], 3, Timing(steps=4, repeats=3), restart=True)
-    assert [speed.checksum for speed in speeds] == [3 * sum(range(5)), 3 * sum(range(100, 105))]
 
 
 def test_calls_get_fewer_steps_where_they_would_take_too_long():
@@ -51,29 +46,18 @@ def test_one_number_of_any_observation_changes_the_digest():
 
 def test_the_same_seed_measures_the_same_steps():
     env, params = st.make("Subterra/TraverseShort-v1")
-    program = prepare(environment_loop(env, params, 4), 4, Timing(steps=3), restart=True)
+    program = prepare(environment_loop(env, params, 4), 4, Timing(steps=3))
+    begin = program._carry
     for seed in (0, 0, 1):
+        program._carry = begin
         program.call(jax.random.key(seed))
     first, again, other = program.totals
     assert first == again
     assert first != other
 
 
-def test_the_floor_reads_and_writes_every_leaf_and_simulates_nothing():
-    carry = (jnp.zeros((5, 18)), {"steps": jnp.zeros(5, jnp.int32), "heading": jnp.zeros(5)})
-    (obs, state), _, done = floor_loop(Loop(lambda *_: carry, counting().step)).step(jax.random.key(0), carry, None)
-    assert np.all(np.asarray(obs) != 0.0)
-    assert np.all(np.asarray(state["steps"]) != 0)
-    assert np.all(np.asarray(state["heading"]) != 0.0)
-    assert np.ptp(np.asarray(obs), axis=1).max() == 0.0
-    assert done == 0.0
-
-
 def test_sizes_are_measured_once_each_and_stop_at_4096_on_a_cpu(monkeypatch):
     assert ThroughputConfig(n=(16, 1, 16)).sizes() == (1, 16)
     assert ThroughputConfig().sizes() == (1, 16, 256, 1024, 4096)
-    assert ThroughputConfig().study_size() == 1024
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert ThroughputConfig().sizes()[-1] == 262_144
-    assert ThroughputConfig().study_size() == 65_536
-    assert ThroughputConfig(study_n=8).study_size() == 8

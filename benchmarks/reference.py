@@ -12,8 +12,10 @@ import jax
 import numpy as np
 
 from subterra_jax import lidar
+from subterra_jax.state import EnvParams
 from subterra_jax.tunnel import Tunnel
 from subterra_jax.tunnel.plan import TunnelPlan
+from subterra_jax.tunnel.sources import load_tunnel
 
 # Numbers in one chunk of the table of rays by points; small enough to stay in a processor's cache.
 _CHUNK = 200_000
@@ -188,3 +190,44 @@ def random_poses(
     position = centre + lateral[:, None] * np.stack([-tangent[:, 1], tangent[:, 0]], axis=-1)
     heading = rng.uniform(-np.pi, np.pi, n)
     return Poses(*(value.astype(np.float32) for value in (position, heading, station)))
+
+
+def measure_exactness(plan: TunnelPlan, lining: str, params: EnvParams, n_poses: int, seed: int) -> Agreement:
+    """Compares the LiDAR on this device with float64 brute force over every segment of the same walls.
+
+    Args:
+        plan: Whole tunnel.
+        lining: Variant of its walls.
+        params: Params of an environment made of that plan and lining.
+        n_poses: Random poses, 16 rays each.
+        seed: Seed for the poses.
+    """
+    poses = random_poses(plan, n_poses, np.random.default_rng(seed))
+    ranges = simulate(params.tunnel, poses, params.lidar)
+    return agreement(plan.lining(lining).segments, poses, ranges)
+
+
+def measure_exactness_of_many(
+    names: list[str], lining: str | None, params: EnvParams, n_poses: int, seed: int
+) -> Agreement:
+    """Compares the LiDAR in several tunnels that are in memory together, each as `measure_exactness` does.
+
+    Args:
+        names: Names of the tunnels.
+        lining: Variant of their walls; None is the usual one of each.
+        params: Params of an environment made of these tunnels, in this order.
+        n_poses: Random poses, spread over the tunnels.
+        seed: Seed for the poses.
+    """
+    found = []
+    for index, name in enumerate(names):
+        plan, here = load_tunnel(name), params.replace(tunnel=params.tunnel.pick(index))
+        found.append(
+            measure_exactness(plan, lining or plan.default_lining, here, -(-n_poses // len(names)), seed + index)
+        )
+    return Agreement(
+        n_rays=sum(each.n_rays for each in found),
+        max_error=max(each.max_error for each in found),
+        n_ambiguous=sum(each.n_ambiguous for each in found),
+        n_wrong=sum(each.n_wrong for each in found),
+    )

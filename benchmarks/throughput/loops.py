@@ -1,19 +1,22 @@
-"""JaxNav of JaxMARL beside ours: a disc that navigates by LiDAR through random polygons, at the same batch sizes.
+"""Loops to time: our environment, and JaxNav of JaxMARL, a disc that navigates by LiDAR through random polygons.
 
 Source: Rutherford et al., JaxMARL (NeurIPS 2024); package `jaxmarl`, environment `jaxnav`, which is optional.
 """
 
 import contextlib
+import dataclasses
 import io
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PRNGKeyArray
 
+import subterra_jax as st
 from benchmarks.command import BenchmarkError
 from benchmarks.results import version
 from benchmarks.throughput.timing import Carry, Loop, Speed, Timing, digest, measure
@@ -32,6 +35,24 @@ class Peer:
     speeds: list[Speed] = field(default_factory=list)  # One for each batch size
     # Reason for each batch size, or `all`, that was not measured
     left_out: dict[str, str] = field(default_factory=dict)
+
+
+def environment_loop(env: Any, params: Any, n_envs: int) -> Loop:
+    """Returns the loop of `AutoReset` under random actions, with sensors, noise, reward, contact and resets."""
+    batch = st.AutoReset(env)
+    low, high = (jnp.asarray(bound) for bound in dataclasses.astuple(env.action_space(params)))
+
+    def reset(key: PRNGKeyArray, params: Any) -> Carry:
+        return batch.reset(key, params, n_envs)
+
+    def step(key: PRNGKeyArray, carry: Carry, params: Any) -> tuple[Carry, Array, Array]:
+        action_key, env_key = jax.random.split(key)
+        action = jax.random.uniform(action_key, (n_envs, *low.shape), minval=low, maxval=high)
+        obs, state, reward, terminated, truncated, info = batch.step(env_key, carry[1], action, params)
+        rest = digest((reward, info["final_observation"]))
+        return (obs, state), rest, jnp.mean(terminated | truncated, dtype=jnp.float32)
+
+    return Loop(reset, step, params)
 
 
 def jaxnav_loop(n_envs: int) -> Loop:

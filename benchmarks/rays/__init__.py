@@ -1,1 +1,0 @@
-"""Ranges of the simulator's LiDARs against rays that embree casts in the built mesh."""

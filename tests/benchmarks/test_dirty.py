@@ -1,0 +1,157 @@
+"""The judge of built clouds: figures against a known truth, faults, what a warning excuses, verdicts, cases."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+from benchmarks import dirty
+from benchmarks.command import BenchmarkError, Ran
+from benchmarks.dirty import RIGHT, SILENT, VAGUE, WARNED, Fault, Truth, judge_build, judge_scene, list_faults
+from scene.judging.codes import Code
+
+ROW: dict[str, Any] = {"status": 0, "message": "", "from": 2.0, "to": 18.0, "reversed": False}
+LENGTH, HALF, WALL = 20.0, 2.5, 2.5  # a straight arch 5 m wide and 5 m high
+
+
+def outline(half: float = HALF, floor: float = 0.0, aside: float = 0.0) -> np.ndarray:
+    """A closed section about the middle of its height, m; `floor` lifts its floor, `aside` moves it to the left."""
+    turn = np.linspace(0.0, np.pi, 37)
+    crown = np.stack([half * np.cos(turn), half * np.sin(turn)], axis=1)
+    sides = np.linspace(0.0, -WALL + floor, 9)[1:]
+    left = np.stack([np.full(8, -half), sides], axis=1)
+    bed = np.stack([np.linspace(-half, half, 21)[1:], np.full(20, -WALL + floor)], axis=1)
+    right = np.stack([np.full(7, half), sides[::-1][1:]], axis=1)
+    return np.concatenate([crown, left, bed, right]) + np.array([aside, 0.0])
+
+
+def scene_folder(folder: Path, section: np.ndarray, length: float = LENGTH) -> Path:
+    station = np.linspace(0.0, length, 81)
+    around = np.stack(np.broadcast_arrays(station[:, None], section[:, 0], section[:, 1]), axis=-1)
+    n, m = around.shape[:2]
+    i, j = np.meshgrid(np.arange(n - 1), np.arange(m), indexing="ij")
+    a, b, c, d = i * m + j, i * m + (j + 1) % m, (i + 1) * m + j, (i + 1) * m + (j + 1) % m
+    faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([b, d, c], -1).reshape(-1, 3)])
+    mesh = trimesh.Trimesh(around.reshape(-1, 3), faces, process=False)
+    (folder / "meshes").mkdir(parents=True)
+    for name in ("lining", "lining_smooth"):
+        mesh.export(folder / "meshes" / f"{name}.ply")
+    position = np.stack([station, 0 * station, 0 * station], axis=1)
+    np.savez(folder / "bore.npz", station=station, position=position, filled=np.zeros(81, bool))
+    (folder / "manifest.json").write_text(json.dumps({"frame": {"origin": [1000.0, 0.0, 0.0]}}))
+    (folder / "scene.xml").write_text('<m><geom name="sleeper_0" pos="3 0 0"/></m>')
+    return folder
+
+
+@pytest.fixture
+def truth() -> Truth:
+    station = np.arange(0.0, LENGTH + 0.01, 0.25)
+    axis = np.stack([1000.0 + station, 0 * station, 0 * station], axis=1)
+    section = outline()[:37]
+    at, k = np.meshgrid(np.arange(1.0, 19.0), np.arange(len(section)), indexing="ij")
+    wall = np.stack([1000.0 + at.ravel(), *section[k.ravel()].T], axis=1)
+    full = np.full(len(axis), 2.5)
+    return Truth(axis, wall, (1.0, 19.0), full, 2 * full, 2 * full, np.array([[1003.0, 0.0, -2.5]]))
+
+
+def test_a_scene_that_is_the_truth_has_no_errors(tmp_path: Path, truth: Truth) -> None:
+    row = judge_scene(scene_folder(tmp_path / "scene", outline()), truth)
+    assert row["wall_mean"] < 1e-6
+    assert (row["wall_near"], row["sleeper_f1"], row["reversed"]) == (1.0, 1.0, False)
+    for name in ("width", "height", "floor", "aside"):
+        assert abs(row[f"{name}_worst"]) < 1e-6, name
+    assert not list_faults(row)
+    assert judge_build({**row, "status": 0, "warnings": []}, []) == RIGHT
+
+
+@pytest.mark.parametrize(
+    ("spoil", "named"),
+    [
+        ({"half": HALF + 0.05}, "width +10 cm"),
+        ({"half": HALF + 0.05}, "walls 5.0 cm in the mean"),
+        ({"floor": 0.2}, "floor +20 cm"),
+        ({"aside": 0.05}, "aside +5 cm"),
+        ({"length": LENGTH - 3.0}, "of the span built"),
+        ({"sleeper": 4.0}, "sleeper F1 0.00"),
+    ],
+)
+def test_each_fault_of_a_scene_is_named(tmp_path: Path, truth: Truth, spoil: dict, named: str) -> None:
+    length, sleeper = spoil.pop("length", LENGTH), spoil.pop("sleeper", 3.0)
+    folder = scene_folder(tmp_path / "scene", outline(**spoil), length)
+    truth = replace(truth, sleepers=truth.sleepers + np.array([sleeper - 3.0, 0.0, 0.0]))
+    faults = [fault.text for fault in list_faults(judge_scene(folder, truth))]
+    assert any(named in fault for fault in faults), faults
+
+
+def warning(code: str, start: float | None = None, end: float = 0.0) -> dict[str, Any]:
+    return {"code": code, "text": ""} | ({} if start is None else {"start": start, "end": end})
+
+
+@pytest.mark.parametrize(
+    ("kind", "place", "said", "told"),
+    [
+        ("floor", 10.0, warning(Code.UNSEEN, 7.0, 9.0), True),
+        ("floor", 10.0, warning(Code.UNSEEN, 12.0, 15.0), False),
+        ("floor", 10.0, warning(Code.GRADE), False),
+        ("floor", 10.0, warning(Code.AXES), True),
+        ("width", 10.0, warning(Code.PLACE, 8.0, 8.5), True),
+        ("walls", math.nan, warning(Code.POSES), True),
+        ("sleepers", math.nan, warning(Code.SLEEPERS), True),
+        ("sleepers", math.nan, warning(Code.UNSEEN), False),
+        ("too short", math.nan, warning(Code.CUT_SHORT, 15.0, 16.0), True),
+        ("too short", math.nan, warning(Code.UNSEEN, 15.0, 16.0), False),
+    ],
+)
+def test_a_warning_excuses_the_faults_of_its_code_at_its_place_and_no_other(
+    kind: str, place: float, said: dict, told: bool
+) -> None:
+    fault = Fault(kind, "x", place)
+    assert judge_build({**ROW, "warnings": [said]}, [fault]) == (WARNED if told else VAGUE)
+    assert judge_build({**ROW, "warnings": []}, [fault]) == SILENT
+
+
+def test_a_scene_may_count_from_the_other_end() -> None:
+    fault, row = Fault("floor", "floor -4 cm", 4.0), {**ROW, "warnings": [warning(Code.PLACE, 13.0, 15.0)]}
+    assert judge_build(row, [fault]) == VAGUE
+    assert judge_build({**row, "reversed": True}, [fault]) == WARNED
+
+
+def test_cases_are_found_built_once_and_judged(tmp_path: Path, truth: Truth, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder, out, built = tmp_path / "set", tmp_path / "out", []
+    folder.mkdir()
+    values = {"axis": truth.axis, "wall": truth.wall, "span": truth.span, "width": 5.0}
+    for name in ("arch", "bent", "room"):
+        np.savez(folder / f"{name}_truth.npz", **values)
+    with pytest.raises(BenchmarkError, match="no cloud arch"):
+        dirty.find_cases(folder)
+    for name in ("arch", "bent", "room"):
+        (folder / f"{name}.ply").touch()
+    with pytest.raises(BenchmarkError, match="begins with road"):
+        dirty.find_cases(folder, ("road",))
+    np.savez(folder / "bent_truth.npz", axis=truth.axis)
+    with pytest.raises(BenchmarkError, match=r"bent_truth\.npz: has no span and no wall"):
+        dirty.load_truth(folder / "bent_truth.npz")
+
+    def build(module: str, source: Path, _: str, scene: Path, *words: object, log: Path) -> Ran:
+        built.append((module, *words))
+        if source.stem == "room":
+            return Ran(2, "error: a room", 1.0)
+        scene_folder(scene, outline())
+        return Ran(0, "", 1.0)
+
+    monkeypatch.setattr(dirty, "run_module", build)
+    for _ in range(2):
+        words = [str(folder), "--out", str(out), "--only", "arch", "room", "--flags", "--fast yes"]
+        assert dirty.main(words) == 0
+    assert built == [("scene.build", "--fresh", "--fast", "yes")] * 2, "what is there was built again"
+    rows = {row["name"]: row for row in json.loads((out / "dirty.json").read_text())["rows"]}
+    assert {name: row["verdict"] for name, row in rows.items()} == {"arch": "right", "room": "refused"}
+    assert "| arch | right | 0.00 | 100.00 |" in (out / "dirty.md").read_text()
+    assert not (out / "scenes" / "arch").exists()
+    found = {one["id"]: (one["value"], one["n"]) for one in json.loads((out / "records.json").read_text())["records"]}
+    assert found == {"dirty/wall-mean": (0.0, 1), "dirty/wall-within-10-cm": (100.0, 1)}
