@@ -8,9 +8,9 @@ import pytest
 import subterra_jax as st
 from benchmarks.board import __main__ as command
 from benchmarks.board import again, cells, columns, drive, picture, roster, tables
+from benchmarks.board.__main__ import records_of
 from benchmarks.board.columns import OWN, Column, Setting
 from benchmarks.board.drive import BoardConfig, Job
-from benchmarks.board.tables import records_of
 from benchmarks.command import BenchmarkError
 from benchmarks.records import read_records
 from subterra_jax.baselines import registry

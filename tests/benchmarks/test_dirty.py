@@ -146,7 +146,7 @@ def test_cases_are_found_built_once_and_judged(tmp_path: Path, truth: Truth, mon
 
     monkeypatch.setattr(dirty, "run_module", build)
     for _ in range(2):
-        words = [str(folder), "--out", str(out), "--only", "arch", "room", "--flags", "--fast yes"]
+        words = [str(folder), "--out", str(out), "--only", "arch", "room", "--flags=--fast yes"]
         assert dirty.main(words) == 0
     assert built == [("scene.build", "--fresh", "--fast", "yes")] * 2, "what is there was built again"
     rows = {row["name"]: row for row in json.loads((out / "dirty.json").read_text())["rows"]}

@@ -74,7 +74,7 @@ def test_a_recording_must_be_whole_before_a_program_runs_on_it(drive, tmp_path, 
     (one / "recording" / "recording.mcap").write_bytes(data[: len(data) // 2])
     refused("one/recording: not a whole recording")
     (one / "recording" / "metadata.yaml").unlink()
-    refused("holds no recordings")
+    refused("is no recording: metadata.yaml is missing")
     assert not out.exists()
 
 
