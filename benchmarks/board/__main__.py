@@ -10,7 +10,7 @@ those in a file `--cells`: `benchmarks/board/cells.jsonl` holds those on record.
 import json
 import sys
 
-from benchmarks.board import picture, tables
+from benchmarks.board import tables
 from benchmarks.board.cells import Cell, Cells, Score, keys_of, over_split, read_cells, setting_of
 from benchmarks.board.columns import OWN, Setting
 from benchmarks.board.drive import BoardConfig, check, choose_by_rule, conditions_of_parts, drive, is_there, jobs_of
@@ -38,7 +38,7 @@ def run(config: BoardConfig) -> None:
     cells = read_cells(config.cells or config.out / "cells", conditions_of_parts(config))
     write_file(config.out / "cells.jsonl", "".join(json.dumps(cell) + "\n" for cell in cells).encode())
     write_file(config.out / "board.md", tables.as_markdown(cells).encode())
-    write_file(config.out / "board.png", png_bytes(picture.draw(cells), dpi=110))
+    write_file(config.out / "board.png", png_bytes(tables.draw(cells), dpi=110))
     write_records(config.out / "records.json", records_of(cells))
     if table := tables.screen_markdown(cells):
         print(table)

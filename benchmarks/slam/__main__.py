@@ -15,7 +15,7 @@ from rich.table import Table
 from benchmarks.command import run_main
 from benchmarks.records import write_records
 from benchmarks.results import environment_facts, png_bytes, write_file
-from benchmarks.slam import board_page, score_page
+from benchmarks.slam import board_page, score
 from benchmarks.slam.arena.sets import ArenaConfig, make_arena
 from benchmarks.slam.board import BoardConfig, make_board
 from benchmarks.slam.score import ProgramScore, ScoreConfig, score_all
@@ -63,16 +63,16 @@ def main(config: ArenaConfig | BoardConfig | SubmissionConfig | ScoreConfig) -> 
         scores = score_all(config)
         if config.out is not None:
             _write_scores(config.out, scores)
-        table = Table(*score_page.HEAD)
-        for row in score_page.as_rows(scores):
+        table = Table(*score.HEAD)
+        for row in score.as_rows(scores):
             table.add_row(*row)
         Console(width=190).print(table)
 
 
 def _write_scores(folder: Path, scores: list[ProgramScore]) -> None:
-    write_file(folder / "scores.json", score_page.as_json(scores, environment_facts()).encode())
-    write_file(folder / "scores.md", score_page.as_markdown(scores).encode())
-    write_file(folder / "scores.png", png_bytes(score_page.draw(scores), dpi=130))
+    write_file(folder / "scores.json", score.as_json(scores, environment_facts()).encode())
+    write_file(folder / "scores.md", score.as_markdown(scores).encode())
+    write_file(folder / "scores.png", png_bytes(score.draw(scores), dpi=130))
 
 
 def _write_board(folder: Path) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 import subterra_jax as st
 from benchmarks.board import __main__ as command
-from benchmarks.board import again, cells, columns, drive, picture, roster, tables
+from benchmarks.board import again, cells, columns, drive, roster, tables
 from benchmarks.board.__main__ import records_of
 from benchmarks.board.columns import OWN, Column, Setting
 from benchmarks.board.drive import BoardConfig, Job
@@ -97,7 +97,7 @@ def test_tables_and_records_hold_every_agent():
 def test_the_picture_names_every_agent_between_floor_and_ceiling_and_marks_its_group():
     names = ("fused", "ring-filter", "locate-map", "locate-transformer")
     some = [cell(name, 0.5, splits=SPLITS) for name in (*names, "oracle")]
-    figure = picture.draw([*some, cell("ceiling", 0.9, splits=SPLITS)])
+    figure = tables.draw([*some, cell("ceiling", 0.9, splits=SPLITS)])
     (axes,) = figure.axes
     assert axes.patches[0].get_extents().transformed(axes.transData.inverted()).intervalx == pytest.approx([30.0, 90.0])
     assert [label.get_text() for label in axes.get_yticklabels()] == list(names)

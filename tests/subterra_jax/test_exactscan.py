@@ -16,7 +16,7 @@ from subterra_jax.baselines.wallmap import wall_map
 from tests.subterra_jax import tunnels
 
 EXACT, WIDTH, OFF = ExactParams(), 2.7, (0.01, 0.003)  # m; m and rad, a standard deviation each
-likelihood = jax.jit(exact_likelihood)
+likelihood, cast = jax.jit(exact_likelihood), jax.jit(cast_beams)
 
 
 @pytest.fixture(scope="module", params=["straight", "bend"])
@@ -32,7 +32,7 @@ def pose_of(station, lateral, heading) -> TunnelPose:
 
 
 def scan_at(place, lateral: float, heading: float):
-    return cast_beams(*place_at(place, lateral, heading), EXACT).expected[:, 0]
+    return cast(*place_at(place, lateral, heading), EXACT).expected[:, 0]
 
 
 def place_at(place, lateral: float, heading: float):
@@ -57,7 +57,7 @@ def test_a_pose_that_is_a_little_off_loses_what_its_offset_and_heading_are_worth
 def test_it_is_the_least_over_offset_and_heading_that_an_optimiser_finds(place, off):
     walls, pose, params = place_at(place, 0.3 + off[0], 0.2 + off[1])
     ranges = scan_at(place, 0.3, 0.2) + 0.05 * np.random.default_rng(1).normal(size=16).astype(np.float32)
-    beams = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64)[:, 0], cast_beams(walls, pose, params, EXACT))
+    beams = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64)[:, 0], cast(walls, pose, params, EXACT))
     lost, far = 0.1 * EXACT.lost, float(params.lidar.range_max)
     seen = np.asarray(ranges, np.float64) < far - 1e-3
     empty = beams.expected >= far - 1e-3
@@ -78,7 +78,7 @@ def test_a_box_before_a_wall_costs_what_a_false_echo_does_in_place_of_a_true_one
     ranges = scan_at(place, 0.3, 0.2)
     boxed = ranges.at[3:5].set(1.5)
     lost = gain(place, ranges, 0.3, 0.2) - gain(place, boxed, 0.3, 0.2)
-    beams = cast_beams(*place_at(place, 0.3, 0.2), EXACT)
+    beams = cast(*place_at(place, 0.3, 0.2), EXACT)
     true = np.abs(beams.slant[3:5, 0]) / np.sqrt(2.0 * np.pi * beams.variance[3:5, 0])
     # One echo in fifty is false, anywhere within 30 m as likely; the root of it counts.
     assert lost == pytest.approx(0.5 * np.sum(np.log(true / (0.02 / 30.0))), abs=0.3)
@@ -87,7 +87,7 @@ def test_a_box_before_a_wall_costs_what_a_false_echo_does_in_place_of_a_true_one
 
 
 def test_a_beam_ends_as_unsure_as_its_range_is_and_as_the_tangent_leaves_its_wall(place):
-    beams = cast_beams(*place_at(place, 0.0, 0.0), EXACT)
+    beams = cast(*place_at(place, 0.0, 0.0), EXACT)
     across, sigma = np.asarray(beams.expected[:, 0] * beams.slant[:, 0]), np.sqrt(np.asarray(beams.variance[:, 0]))
     square, ahead = 4, 1  # at 90 and 22.5 degrees
     assert sigma[square] == pytest.approx(np.hypot(0.05, 0.005 + 0.001 * WIDTH), rel=0.02)
@@ -97,9 +97,9 @@ def test_a_beam_ends_as_unsure_as_its_range_is_and_as_the_tangent_leaves_its_wal
 
 def test_the_wall_that_a_slanting_beam_meets_runs_as_the_bend_does(place):
     walls, pose, params = place_at(place, 0.0, 0.0)
-    beams, turn = cast_beams(walls, pose, params, EXACT), 1e-3
-    moved = cast_beams(walls, dataclasses.replace(pose, heading=pose.heading + turn), params, EXACT)
-    shifted = cast_beams(walls, dataclasses.replace(pose, lateral=pose.lateral + turn), params, EXACT)
+    beams, turn = cast(walls, pose, params, EXACT), 1e-3
+    moved = cast(walls, dataclasses.replace(pose, heading=pose.heading + turn), params, EXACT)
+    shifted = cast(walls, dataclasses.replace(pose, lateral=pose.lateral + turn), params, EXACT)
     ends = np.asarray(beams.expected)[:, 0] < float(params.lidar.range_max) - 1.0
     for other, lever in ((moved, beams.along), (shifted, 1.0)):
         # What a beam gains by a turn or a shift to its wall, it loses in range.

@@ -1,6 +1,7 @@
 """The kernels for NVIDIA GPUs, here in Pallas' interpreter, against XLA's and against float64 brute force."""
 
 import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -31,17 +32,21 @@ def plan() -> st.TunnelPlan:
     return piece_of(None)
 
 
-def nodes(tunnel: Tunnel, station: np.ndarray) -> jax.Array:
-    return jax.vmap(node_at, (None, 0))(tunnel, jnp.asarray(station))
+nodes = jax.jit(jax.vmap(node_at, (None, 0)))  # eager code would compile every operation by itself
 
 
 def scan_by_kernel(
     tunnel: Tunnel, poses: reference.Poses, wanted: np.ndarray | None = None, n_beams: int = 16, range_max: float = 30.0
 ) -> np.ndarray:
     wanted = np.ones(len(poses.station), bool) if wanted is None else wanted
-    start = tunnel.visit_first[nodes(tunnel, poses.station)]
-    rows = jnp.asarray(poses.position), jnp.asarray(poses.heading), start, jnp.asarray(wanted)
-    return np.asarray(gpu.scan(tunnel, *rows, jnp.float32(range_max), lidar.bearings(n_beams)))
+    rows = poses.position, poses.heading, poses.station, wanted
+    return np.asarray(_scan(tunnel, *rows, np.float32(range_max), n_beams))
+
+
+@partial(jax.jit, static_argnames="n_beams")
+def _scan(tunnel, position, heading, station, wanted, range_max, n_beams):
+    start = tunnel.visit_first[jax.vmap(node_at, (None, 0))(tunnel, station)]
+    return gpu.scan(tunnel, position, heading, start, wanted, range_max, lidar.bearings(n_beams))
 
 
 @pytest.mark.parametrize("n_beams", [1, 12, 16])
@@ -164,8 +169,14 @@ def places(plan: st.TunnelPlan, lining: str, seed: int) -> tuple[np.ndarray, np.
 
 def both(tunnel: Tunnel, position: np.ndarray, node: jax.Array) -> tuple[np.ndarray, np.ndarray]:
     """Distances by the kernel and by XLA, m."""
-    by_xla = jax.vmap(unicycle._gap, (None, 0, 0))(tunnel, jnp.asarray(position), node)
-    return np.asarray(gpu.clearance(tunnel, jnp.asarray(position), tunnel.visit_first[node])), np.asarray(by_xla)
+    found, by_xla = _clearances(tunnel, position, node)
+    return np.asarray(found), np.asarray(by_xla)
+
+
+@jax.jit
+def _clearances(tunnel, position, node):
+    by_xla = jax.vmap(unicycle._gap, (None, 0, 0))(tunnel, position, node)
+    return gpu.clearance(tunnel, position, tunnel.visit_first[node]), by_xla
 
 
 def assert_equal(found: np.ndarray, truth: np.ndarray) -> None:

@@ -53,7 +53,7 @@ def test_a_belief_spreads_as_the_errors_of_dead_reckoning_do(smooth):
     _, params = smooth
     filter_ = localiser(params)
     still = certain(filter_)
-    memory = still.begin(seen(), params)
+    memory = jax.jit(still.begin)(seen(), params)
     slide = jax.jit(still._slide)
     mass = jnp.exp(memory.log_mass)
     for _ in range(100):
@@ -69,10 +69,10 @@ def test_a_row_of_errors_slides_by_its_share_of_the_way_and_back_again(smooth):
     _, params = smooth
     filter_ = localiser(params)
     still = certain(filter_)
-    memory = still.begin(seen(), params)
+    memory = jax.jit(still.begin)(seen(), params)
     mass = jnp.exp(memory.log_mass)
     slide = jax.jit(still._slide)
-    tape = np.asarray(still._tape(memory.origin))
+    tape = np.asarray(jax.jit(still._tape)(memory.origin))
 
     def middle(rows):
         weight = np.asarray(rows[0, -1], np.float64)

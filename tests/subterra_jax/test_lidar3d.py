@@ -1,6 +1,7 @@
 """3-D LiDAR: tubes and boxes with known answers, and float64 brute force over every triangle of a rough bend."""
 
 import re
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -172,6 +173,7 @@ def bend_rays(axis, n: int, seed: int):
     return origin, way, axis["station"][pick].astype(np.float32)
 
 
+@partial(jax.jit, static_argnums=0)
 def found_by(find, relief, origin, way, station):
     """Hits of rays by one of the ways to march them."""
     block = jax.vmap(casting.block_at, (None, 0, 0))(relief, origin, station)
@@ -192,7 +194,7 @@ def test_scans_of_one_place_meet_what_rays_of_a_place_each_meet(reliefs):
     origin, way, station = bend_rays(surfaces.axis_of(LENGTH), 96, 5)
     origin, station, relief = origin[::32], station[::32], reliefs["things"]
     block, limit = jax.vmap(casting.block_at, (None, 0, 0))(relief, origin, station), jnp.full(3, 30.0)
-    hits, normal = fused.find(relief, jnp.asarray(origin), jnp.asarray(way).reshape(3, 4, 8, 3), block, limit)
+    hits, normal = jax.jit(fused.find)(relief, origin, way.reshape(3, 4, 8, 3), block, limit)
     each, own = found_by(fused.find, relief, np.repeat(origin, 32, 0), way, np.repeat(station, 32))
     for one, other in zip((*hits, *normal), (*each, *own), strict=True):
         np.testing.assert_allclose(np.ravel(one), other, rtol=1e-6, atol=1e-6)
@@ -368,4 +370,4 @@ def test_a_batch_that_cannot_fit_is_refused_with_what_would(reliefs, monkeypatch
     place = jnp.zeros((100, 3)).at[:, 0].set(30.0)
     beam = jnp.asarray(beams.planar(512))
     with pytest.raises(st.SubterraError, match=r"51,200 rays .* at most [0-9,]+ at once"):
-        jax.vmap(lidar3d.cast, (None, 0, None, 0, None))(reliefs["tube"], place, beam, place[:, 0], 30.0)
+        jax.jit(jax.vmap(lidar3d.cast, (None, 0, None, 0, None)))(reliefs["tube"], place, beam, place[:, 0], 30.0)

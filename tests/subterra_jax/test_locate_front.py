@@ -1,5 +1,6 @@
 """The front end of learnt localisers against known walls: level beams, strips of a spinning LiDAR, bends."""
 
+from functools import partial
 from types import SimpleNamespace
 
 import jax
@@ -20,7 +21,7 @@ from tests.subterra_jax.patches import HALF, N_METRES, drive_past, patches
 @pytest.mark.parametrize("share", [-0.03, 0.0, 0.02])
 def test_the_untrained_front_end_finds_the_error_of_the_command(share):
     record = jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype != bool else x, drive_past(share))
-    blocks = jax.jit(lambda r: streams.metres(r, matching.init(jax.random.key(0)), N_METRES))(record)
+    blocks = _metres(record, N_METRES)
     total = np.asarray(blocks.evidence)[DELAY + 10 :].sum(axis=0)
     assert matching.SHARES[total.argmax()] == pytest.approx(share, abs=0.0045)
     assert total.max() - total.mean() > 3.0
@@ -29,7 +30,7 @@ def test_the_untrained_front_end_finds_the_error_of_the_command(share):
 def test_smooth_walls_tell_nothing():
     record = drive_past(0.02, sigma=0.0)
     record = record.replace(points=record.points.replace(out=jnp.zeros_like(record.points.out)))
-    blocks = streams.metres(record, matching.init(jax.random.key(0)), N_METRES)
+    blocks = _metres(record, N_METRES)
     assert np.ptp(np.asarray(blocks.evidence), axis=1).max() < 0.2
 
 
@@ -47,6 +48,18 @@ def _image(station, sensor, low=-9.0, high=9.0):
     return np.minimum(reach, 30.0)
 
 
+@partial(jax.jit, static_argnums=2)
+def _sense(image, yaw, name):
+    """The strips of an image between walls to either side of a robot that is turned, rad."""
+    sensor, half = make_sensor(name), jnp.float32(HALF)
+    return strips.sense(_seen(image, sensor), Corridor(half, half, yaw), SimpleNamespace(lidar=sensor))
+
+
+@partial(jax.jit, static_argnums=1)
+def _metres(record, n):
+    return streams.metres(record, matching.init(jax.random.key(0)), n)
+
+
 def _seen(image, sensor):
     scan = jnp.asarray(image, jnp.float32)
     level = level_ring(scan, sensor.shape)
@@ -55,10 +68,8 @@ def _seen(image, sensor):
 
 def test_a_spinning_lidar_sees_strips_of_the_wall_at_their_heights():
     sensor = make_sensor("spin16x64")
-    params = SimpleNamespace(lidar=sensor)
-    walls = Corridor(jnp.float32(HALF), jnp.float32(HALF), jnp.float32(0.0))
-    flat_walls = strips.sense(_seen(_image(3.0, sensor, 0.0, 0.0), sensor), walls, params)
-    points = strips.sense(_seen(_image(3.0, sensor, 0.5, 0.8), sensor), walls, params)
+    flat_walls = _sense(_image(3.0, sensor, 0.0, 0.0), np.float32(0.0), "spin16x64")
+    points = _sense(_image(3.0, sensor, 0.5, 0.8), np.float32(0.0), "spin16x64")
     assert points.seen.shape == (2 * len(strips.HEIGHTS) * strips.RAYS, 7)
     assert points.n_sides == strips.n_sides(sensor) == 12
     assert np.mean(points.seen) > 0.9, "the farthest returns lie beyond reach"
@@ -79,8 +90,7 @@ def test_walls_turned_by_a_heading_are_straight_again():
         [[np.cos(yaw), np.sin(yaw), 0], [-np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]]
     )
     image = np.minimum(HALF / np.maximum(np.abs(turned[:, 1]), 1e-6), 30.0)
-    walls = Corridor(jnp.float32(HALF), jnp.float32(HALF), jnp.float32(yaw))
-    points = strips.sense(_seen(image, sensor), walls, SimpleNamespace(lidar=sensor))
+    points = _sense(image, np.float32(yaw), "spin16x64")
     np.testing.assert_allclose(np.asarray(points.out)[np.asarray(points.seen)], 0.0, atol=1e-4)
     assert np.mean(points.seen) > 0.9
 
@@ -88,17 +98,15 @@ def test_walls_turned_by_a_heading_are_straight_again():
 @pytest.mark.parametrize("share", [-0.02, 0.02])
 def test_strips_above_the_level_ring_tell_the_error_of_the_command(share):
     sensor = make_sensor("spin16x64")
-    params = SimpleNamespace(lidar=sensor)
-    walls = Corridor(jnp.float32(HALF), jnp.float32(HALF), jnp.float32(0.0))
     driven = np.float32(0.2) * np.arange(5 * 30 + 2)
     images = np.stack([_image((1.0 + share) * d, sensor, 0.25, 9.0) for d in driven])
-    points = jax.vmap(lambda image: strips.sense(_seen(image, sensor), walls, params))(jnp.asarray(images))
+    points = jax.jit(jax.vmap(lambda image: _sense(image, np.float32(0.0), "spin16x64")))(images)
     record = streams.Record(jnp.asarray(driven), jnp.asarray((1.0 + share) * driven), points)
-    blocks = jax.jit(lambda r: streams.metres(r, matching.init(jax.random.key(0)), 30))(record)
+    blocks = _metres(record, 30)
     total = np.asarray(blocks.evidence)[DELAY + 8 :].sum(axis=0)
     assert matching.SHARES[total.argmax()] == pytest.approx(share, abs=0.0045)
     level = record.replace(points=jax.tree.map(lambda leaf: leaf[:, : 4 * strips.RAYS], points))
-    blind = streams.metres(level, matching.init(jax.random.key(0)), 30)
+    blind = _metres(level, 30)
     assert np.ptp(np.asarray(blind.evidence), axis=1).max() < 0.2, "at the level of the sensor the wall is smooth"
 
 
@@ -119,9 +127,9 @@ def test_a_bend_is_found_and_its_points_are_put_along_the_axis(radius):
         out.append(side * y - HALF)
         station.append(radius * np.arctan2(np.sign(radius) * x, np.sign(radius) * (radius - y)))
     points = Points(*(jnp.asarray(np.stack(rows), jnp.float32) for rows in (along, out)), jnp.ones((2, 7), bool))
-    bend = jnp.zeros(())
+    bend, follow = jnp.zeros(()), jax.jit(bends.follow)
     for _ in range(120):
-        bend = bends.follow(bend, points, jnp.float32(0.2))
+        bend = follow(bend, points, np.float32(0.2))
     assert float(bend) == pytest.approx(1.0 / radius, rel=0.05)
     walls = Corridor(jnp.float32(HALF), jnp.float32(HALF), jnp.float32(0.0))
     straight = bends.straighten(points, walls, bend)

@@ -16,12 +16,14 @@ from tests.subterra_jax.patches import HALF, N_METRES, drive_past, map_of_walls,
 
 def _beliefs(weights, share, told, sigma, strip, passed):
     record = jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype != bool else x, drive_past(share))
-    whole = streams.profiles_of(record, N_METRES)
-    rate = jnp.full(N_METRES, 0.0)
-    scalar = jnp.float32
-    return map_filter.sequence(
-        weights, whole, streams.BEFORE, strip.pick(0), scalar(told), scalar(sigma), jnp.asarray(passed), rate
-    )
+    return _sequence(weights, record, strip, np.float32(told), np.float32(sigma), passed)
+
+
+@jax.jit
+def _sequence(weights, record, strip, told, sigma, passed):
+    whole, rate = streams.profiles_of(record, N_METRES), jnp.zeros(N_METRES)
+    beliefs = map_filter.sequence(weights, whole, streams.BEFORE, strip.pick(0), told, sigma, passed, rate)
+    return beliefs, map_filter.place(jax.tree.map(lambda leaf: leaf[-1], beliefs))
 
 
 # The relief is met from station 0 of `patches` on; the map begins 50 m before.
@@ -31,8 +33,9 @@ def test_a_map_tells_how_far_the_start_is_off(offset, share):
     passed = (
         np.maximum(np.arange(N_METRES) - DELAY + 1.0, 0.0) * share
     )  # what a perfect localiser says of the metres passed
-    beliefs = _beliefs(weights, share, 50.0 - offset, 3.0, map_of_walls(first=-50.0), passed.astype(np.float32))
-    found, sigma, believed = map_filter.place(jax.tree.map(lambda leaf: leaf[-1], beliefs))
+    beliefs, (found, sigma, believed) = _beliefs(
+        weights, share, 50.0 - offset, 3.0, map_of_walls(first=-50.0), passed.astype(np.float32)
+    )
     assert float(found) == pytest.approx(offset, abs=0.15)
     assert float(sigma) < 0.5
     assert bool(believed)
@@ -41,11 +44,11 @@ def test_a_map_tells_how_far_the_start_is_off(offset, share):
 
 def test_a_map_of_another_tunnel_is_not_believed():
     weights = map_filter.init(jax.random.key(0))
-    beliefs = _beliefs(
+    beliefs, (_, _, believed) = _beliefs(
         weights, 0.0, 50.0, 0.0, map_of_walls(first=-50.0, seed=8, side=4.1), np.zeros(N_METRES, np.float32)
     )
     last = jax.tree.map(lambda leaf: leaf[-1], beliefs)
-    assert not bool(map_filter.place(last)[2])
+    assert not bool(believed)
     plain = Estimate(jnp.float32(1.0), jnp.float32(0.02), jnp.float32(-1.0))
     kept = map_filter.corrected(last, plain, jnp.float32(N_METRES), jnp.float32(0.0))
     assert float(kept.correction) == 1.0

@@ -11,9 +11,9 @@ import yaml
 from jaxtyping import Float
 
 from benchmarks.results import write_file
-from benchmarks.slam.arena import bags, dust, wheels
+from benchmarks.slam.arena import bags, dust
 from benchmarks.slam.arena.bags import FormatName, Message
-from benchmarks.slam.arena.drives import REST, Drive, MotionName, draw_drive
+from benchmarks.slam.arena.drives import REST, WHEEL_RATE, Drive, MotionName, draw_drive, measure_wheels
 from benchmarks.slam.arena.walls import WallName, draw_walls
 from scene.survey import carrier, messages
 from scene.survey.carrier import Carried, Mount, Poses
@@ -136,9 +136,9 @@ def _inertial(scene: Scene) -> list[Message]:
 
 
 def _odometry(scene: Scene) -> tuple[list[Message], Float[np.ndarray, "n"], Poses]:
-    time = np.arange(round(scene.drive.duration * wheels.RATE)) / wheels.RATE
+    time = np.arange(round(scene.drive.duration * WHEEL_RATE)) / WHEEL_RATE
     rng = np.random.default_rng(scene.seeds["wheels"])
-    position, quaternion = wheels.measure_wheels(rng, scene.drive.station(time), scene.drive.poses(time))
+    position, quaternion = measure_wheels(rng, scene.drive.station(time), scene.drive.poses(time))
     rows = zip(np.rint(time * 1e9).astype(np.int64), position, quaternion, strict=True)
     stamped = [bags.odometry_message(int(t), p, q, scene.sensor.frame) for t, p, q in rows]
     return stamped, time, Poses(position, quaternion)
@@ -170,7 +170,7 @@ def calibration(scene: Scene) -> dict[str, Any]:
             "gyro_noise_density": carrier.GYRO_SIGMA / root, "gyro_random_walk": carrier.GYRO_WALK,
             "accel_bias_sigma": carrier.ACCEL_BIAS, "gyro_bias_sigma": carrier.GYRO_BIAS, "gravity": carrier.GRAVITY,
         },
-        "wheels": {"topic": "/odom", "rate": wheels.RATE},
+        "wheels": {"topic": "/odom", "rate": WHEEL_RATE},
     }  # fmt: skip
 
 

@@ -7,8 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.command import BenchmarkError, run_module
-from benchmarks.draw.frame import Stretch, load_frame
-from benchmarks.draw.paper import depth_image, main
+from benchmarks.draw.paper import Stretch, depth_image, load_frame, main
 from benchmarks.draw.scene import Pose
 from tests.scene.bags import write_bag, write_tum
 

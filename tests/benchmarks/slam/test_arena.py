@@ -13,8 +13,8 @@ from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
 from benchmarks.slam.__main__ import command
-from benchmarks.slam.arena import bags, describe, record, sets, wheels
-from benchmarks.slam.arena.drives import CARRIERS, REST
+from benchmarks.slam.arena import bags, describe, record, sets
+from benchmarks.slam.arena.drives import CARRIERS, REST, measure_wheels
 from benchmarks.slam.arena.dust import draw_dust
 from benchmarks.slam.arena.walls import draw_walls
 from benchmarks.slam.reading import read_samples, sweep_points
@@ -206,7 +206,7 @@ def test_wheels_have_one_sign_a_robot_and_the_scale_of_real_corridors():
     still = Poses(np.zeros((len(station), 3)), np.tile([0.0, 0.0, 0.0, 1.0], (len(station), 1)))
     errors, signs = [], set()
     for seed in range(8):
-        position, _ = wheels.measure_wheels(np.random.default_rng(seed), station, still)
+        position, _ = measure_wheels(np.random.default_rng(seed), station, still)
         steps = np.linalg.norm(np.diff(position, axis=0), axis=1).reshape(-1, 40).sum(axis=1) / 20.0 - 1.0
         signs.add(np.sign(np.median(steps)))
         errors.append(np.median(np.sign(steps)) * steps)
