@@ -48,7 +48,7 @@ MISTAKES = {
     "benchmarks.board --out o --splits --further none.npz": "none.npz: no such tunnel file",
     "benchmarks.board --out text.txt/x": "text.txt: is a file",
     "benchmarks.board.again --out o --agents nobody": "holds no cell of these tasks and agents",
-    "benchmarks.draw moon": "nothing to draw is named 'moon'; there are kinds, scene, paper",
+    "benchmarks.draw moon": "nothing to draw is named 'moon'; there are kinds, scene, paper, film",
     "benchmarks.records": "say one of render, check, keep, compare",
     "benchmarks.records keep none.json": "none.json: holds no records",
     "benchmarks.records compare none.json": "none.json: holds no records",

@@ -1,1 +1,1 @@
-"""Pictures: `kinds` of lining, a `scene`, and the `paper`'s figures."""
+"""Pictures: `kinds` of lining, a `scene`, the `paper`'s figures, a `film`."""
