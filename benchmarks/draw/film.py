@@ -17,8 +17,6 @@ from matplotlib.collections import LineCollection
 from matplotlib.patches import Circle
 from matplotlib.transforms import Affine2D
 from PIL import Image
-from subterra_jax.viewer.driving import drive
-from subterra_jax.viewer.recording import Recording
 
 import subterra_jax as st
 from benchmarks.command import BenchmarkError, run_main
@@ -26,12 +24,16 @@ from benchmarks.results import write_file
 from subterra_jax import policies
 from subterra_jax.host.files import require_file
 from subterra_jax.parts.spatial_lidar import SENSORS
+from subterra_jax.recorder.trace import drive
 from subterra_jax.state import EnvParams
+from subterra_jax.tasks import TASKS, find, first_tunnel, is_planar
 from subterra_jax.tunnel import Tunnel
 from subterra_jax.tunnel_env import TunnelEnv
+from subterra_jax.viewer.episode import Drawn, draw
 
 _AHEAD, _ASIDE = 20.0, 4.5  # half sides of what the plan shows, m
 _PICTURE = 80  # time of a picture on screen, ms
+_DRAWN_BEAMS = 64  # of a LiDAR with more the returns alone are drawn
 _LAST = 1500  # time of the last picture, ms
 _WALL, _BEAM, _TRUTH, _ODOMETER, _AGENT, _GOAL = "#222222", "#e09f3e", "#1b4965", "#c1121f", "#2a9d8f", "#8d99ae"
 
@@ -67,32 +69,38 @@ def run(config: FilmConfig) -> None:
     if not 2 <= config.pictures <= 1000:
         raise BenchmarkError(f"pictures must be 2 to 1000, got {config.pictures}")
     require_file(config.out, ".webp")
-    env, params = st.make(config.task, tunnel=config.tunnel, sensor=config.sensor)
-    agent = policies.open_agent(config.agent, env, params)
-    name = "a trained policy" if Path(config.agent).exists() else config.agent
-    recording = drive_whole(env, params, agent, config.seed, str(config.tunnel or ""), name)
-    write_file(config.out, film(params, recording, config.pictures))
-    outcome = "success" if recording.success else "contact" if recording.contact else "no success"
-    print(f"{config.out}: {recording.duration:.0f} s of driving, {outcome}")
+    env, params, drawn = drive_whole(config)
+    agent = "a trained policy" if Path(config.agent).exists() else config.agent
+    title = f"{env.id.split('/')[-1]}, driven by {agent}"
+    write_file(config.out, film(params, drawn, title, config.pictures))
+    print(f"{config.out}: {drawn.trace.time[-1]:.0f} s of driving, {_end(drawn)}")
 
 
-def drive_whole(env: TunnelEnv, params: EnvParams, agent: Any, seed: int, tunnel: str, name: str) -> Recording:
-    """Drives an episode to its end."""
-    *_, recording = drive(
-        env, params, agent, seed, {"tunnel": tunnel, "tunnel_sha256": "", "lining": "", "agent": name}
-    )
-    return recording
+def drive_whole(config: FilmConfig) -> tuple[TunnelEnv, EnvParams, Drawn]:
+    """Drives an episode to its end; returns what it was driven in as well."""
+    task, spatial = find(config.task, short=True), not is_planar(config.sensor)
+    plan = st.load_tunnel(config.tunnel or first_tunnel(task, spatial), solid=spatial)
+    env, params = st.make(task, tunnel=plan, sensor=config.sensor)
+    trace = drive(env, params, policies.open_agent(config.agent, env, params), config.seed)
+    piece = TASKS[task].piece if task in TASKS else None
+    shown = plan if piece is None else plan.slice(piece[0], min(piece[1], plan.length - piece[0]))
+    return env, params, draw(env, params, shown, trace)
 
 
-def film(params: EnvParams, recording: Recording, pictures: int) -> bytes:
+def _end(drawn: Drawn) -> str:
+    return "success" if drawn.trace.success else "contact" if drawn.trace.contact else "no success"
+
+
+def film(params: EnvParams, drawn: Drawn, title: str, pictures: int) -> bytes:
     """Draws an episode as an animated WebP.
 
     Args:
         params: The task in its tunnel.
-        recording: The episode.
+        drawn: The episode.
+        title: Line above the picture.
         pictures: Number of pictures, evenly spread in time.
     """
-    frames = [Image.fromarray(picture) for picture in _pictures(params, recording, pictures)]
+    frames = [Image.fromarray(picture) for picture in _pictures(params, drawn, title, pictures)]
     shown = [_PICTURE] * (len(frames) - 1) + [_LAST]
     buffer = io.BytesIO()
     frames[0].save(
@@ -101,13 +109,13 @@ def film(params: EnvParams, recording: Recording, pictures: int) -> bytes:
     return buffer.getvalue()
 
 
-def _pictures(params: EnvParams, recording: Recording, count: int) -> Iterator[np.ndarray]:
+def _pictures(params: EnvParams, drawn: Drawn, title: str, count: int) -> Iterator[np.ndarray]:
     figure, (plan, strip) = plt.subplots(
         2, 1, figsize=(9.6, 4.6), dpi=84, height_ratios=(1.55, 1.0), layout="constrained"
     )
-    figure.suptitle(f"{recording.task.split('/')[-1]}, driven by {recording.agent}", fontsize=11)
-    draw_plan, draw_strip = _plan(plan, params, recording), _strip(strip, recording)
-    for row in np.unique(np.linspace(0, len(recording) - 1, count).astype(int)):
+    figure.suptitle(title, fontsize=11)
+    draw_plan, draw_strip = _plan(plan, params, drawn), _strip(strip, drawn)
+    for row in np.unique(np.linspace(0, len(drawn) - 1, count).astype(int)):
         draw_plan(row)
         draw_strip(row)
         figure.canvas.draw()
@@ -115,37 +123,36 @@ def _pictures(params: EnvParams, recording: Recording, count: int) -> Iterator[n
     plt.close(figure)
 
 
-def _plan(axes: Axes, params: EnvParams, recording: Recording) -> Any:
+def _plan(axes: Axes, params: EnvParams, drawn: Drawn) -> Any:
     """Prepares the plan around the robot, the tunnel's direction to the right; returns what draws one row."""
-    tunnel = params.tunnel
+    tunnel, state, radius = params.tunnel, drawn.trace.state, float(params.vehicle.radius)
     walls = LineCollection(list(wall_segments(tunnel)), colors=_WALL, linewidths=1.3)
     axes.add_collection(walls)
     beams = LineCollection([], colors=_BEAM, linewidths=0.9, alpha=0.8)
     axes.add_collection(beams)
     (hits,) = axes.plot([], [], ".", color=_BEAM, ms=3.0)
-    axes.add_patch(Circle((0.0, 0.0), recording.radius, color=_TRUTH, zorder=5))
+    axes.add_patch(Circle((0.0, 0.0), radius, color=_TRUTH, zorder=5))
     (nose,) = axes.plot([], [], color=_TRUTH, lw=2.5, zorder=5)
     axes.set(xlim=(-_AHEAD, _AHEAD), ylim=(-_ASIDE, _ASIDE), aspect="equal", yticks=[], ylabel="plan")
     axes.set_xlabel("m from the robot")
     text = axes.text(0.99, 0.03, "", transform=axes.transAxes, ha="right", fontsize=9)
-    goal = "" if np.isnan(recording.goal) else f", goal {recording.goal:.1f} m"
-    end = "success" if recording.success else "contact" if recording.contact else "no success"
+    goal = "" if np.isnan(drawn.goal) else f", goal {drawn.goal:.1f} m"
+    planar = params.lidar.n_beams <= _DRAWN_BEAMS
     grid, spacing = np.asarray(tunnel.grid, np.float64), float(tunnel.spacing)
 
     def draw(row: int) -> None:
-        node = int(np.clip(round(float(recording.station[row]) / spacing), 0, len(grid) - 1))
+        node = int(np.clip(round(float(state.station[row]) / spacing), 0, len(grid) - 1))
         along = float(np.arctan2(grid[node, 3], grid[node, 2]))
         walls.set_transform(
-            Affine2D().translate(*-recording.position[row].astype(float)).rotate(-along) + axes.transData
+            Affine2D().translate(*-np.asarray(state.position[row], float)).rotate(-along) + axes.transData
         )
-        ends = tips(recording, row) @ _rotation(float(recording.heading[row]) - along).T
-        planar = not recording.points.shape[1]
+        ends = tips(drawn, row) @ _rotation(drawn.heading[row] - along).T
         beams.set_segments([np.stack([np.zeros(2), end]) for end in ends] if planar else [])
         hits.set_data(*ends.T)
-        front = _rotation(float(recording.heading[row]) - along) @ np.array([2.0 * recording.radius, 0.0])
+        front = _rotation(drawn.heading[row] - along) @ np.array([2.0 * radius, 0.0])
         nose.set_data([0.0, front[0]], [0.0, front[1]])
-        over = f": {end}" if row == len(recording) - 1 else ""
-        text.set_text(f"station {recording.station[row]:.1f} m{goal}{over}")
+        over = f": {_end(drawn)}" if row == len(drawn) - 1 else ""
+        text.set_text(f"station {state.station[row]:.1f} m{goal}{over}")
 
     return draw
 
@@ -156,24 +163,20 @@ def wall_segments(tunnel: Tunnel) -> Float[np.ndarray, "n 2 2"]:
     return np.stack([vertex[:, :, :-1], vertex[:, :, 1:]], axis=-1).transpose(0, 2, 3, 1).reshape(-1, 2, 2)
 
 
-def tips(recording: Recording, row: int) -> Float[np.ndarray, "n 2"]:
-    """Returns the ends of the beams in the robot's frame, m; of a LiDAR in three dimensions its returns."""
-    if recording.points.shape[1]:
-        return recording.points[row, :, :2]
-    ranges = recording.ranges[row]
-    angle = np.arange(len(ranges)) * (2.0 * np.pi / len(ranges))
-    return ranges[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+def tips(drawn: Drawn, row: int) -> Float[np.ndarray, "n 2"]:
+    """Returns where the beams with a return end, in the robot's frame, m."""
+    ends = drawn.hits[row, :, :2]
+    return ends[np.isfinite(ends).all(axis=1)]
 
 
 def _rotation(angle: float) -> Float[np.ndarray, "2 2"]:
     return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
 
-def _strip(axes: Axes, recording: Recording) -> Any:
+def _strip(axes: Axes, drawn: Drawn) -> Any:
     """Prepares the errors of odometer and agent along the way; returns what draws one row."""
-    odometer = recording.start + recording.odometry[:, 0] - recording.station
-    agent = recording.estimate[:, 0] - recording.station
-    time = np.arange(len(recording)) * recording.period
+    odometer, time = drawn.odometer_error, drawn.trace.time
+    agent = drawn.estimate[:, 0] - np.asarray(drawn.trace.state.station, float)
     both = np.concatenate([odometer, agent[np.isfinite(agent)]])
     reach = max(1.15 * float(np.abs(both).max(initial=0.0)), 1.5)
     axes.axhline(0.0, color=_TRUTH, lw=1.5, label="truth")

@@ -6,21 +6,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
-import subterra_jax as st
 from benchmarks.draw import film
-from subterra_jax import policies
 
 
 @pytest.fixture(scope="module")
 def episode():
-    env, params = st.make("Subterra/TraverseShort-v1")
-    agent = policies.open_agent("dead-reckoning", env, params)
-    return params, film.drive_whole(env, params, agent, 0, "", "dead-reckoning")
+    return film.drive_whole(film.FilmConfig(task="Subterra/TraverseShort-v1", agent="dead-reckoning"))[1:]
 
 
 def test_a_film_has_as_many_pictures_as_asked_and_they_move(episode):
-    params, recording = episode
-    picture = Image.open(io.BytesIO(film.film(params, recording, 3)))
+    params, drawn = episode
+    picture = Image.open(io.BytesIO(film.film(params, drawn, "a film", 3)))
     assert picture.n_frames == 3
     shown = []
     for k in range(3):
@@ -31,11 +27,12 @@ def test_a_film_has_as_many_pictures_as_asked_and_they_move(episode):
 
 def test_beams_end_at_the_walls_that_are_drawn(episode):
     """The tips, turned into the tunnel's direction, lie on a segment of the walls within the noise of a range."""
-    params, recording = episode
-    row = len(recording) // 2
-    heading = float(recording.heading[row])
+    params, drawn = episode
+    row = len(drawn) // 2
+    heading = float(drawn.heading[row])
     turn = np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
-    tips = film.tips(recording, row)[recording.ranges[row] < 8.0] @ turn.T + recording.position[row]
+    near = (ends := film.tips(drawn, row))[np.linalg.norm(ends, axis=1) < 8.0]
+    tips = near @ turn.T + drawn.trace.state.position[row]
     assert len(tips) > 4
     start, end = film.wall_segments(params.tunnel).transpose(1, 0, 2)
     along = end - start
