@@ -25,17 +25,14 @@ from subterra_jax import policies
 from subterra_jax.host.files import require_file
 from subterra_jax.parts.spatial_lidar import SENSORS
 from subterra_jax.recorder.trace import drive
-from subterra_jax.state import EnvParams
 from subterra_jax.tasks import TASKS, find, first_tunnel, is_planar
-from subterra_jax.tunnel import Tunnel
-from subterra_jax.tunnel_env import TunnelEnv
 from subterra_jax.viewer.episode import Drawn, draw
 
 _AHEAD, _ASIDE = 20.0, 4.5  # half sides of what the plan shows, m
 _PICTURE = 80  # time of a picture on screen, ms
-_DRAWN_BEAMS = 64  # of a LiDAR with more the returns alone are drawn
 _LAST = 1500  # time of the last picture, ms
-_WALL, _BEAM, _TRUTH, _ODOMETER, _AGENT, _GOAL = "#222222", "#e09f3e", "#1b4965", "#c1121f", "#2a9d8f", "#8d99ae"
+_FEW = 64  # beams that are drawn as lines; of more their ends are
+_WALL, _BEAM, _TRUTH, _ODOMETER, _AGENT = "#222222", "#e09f3e", "#1b4965", "#c1121f", "#2a9d8f"
 
 
 @dataclass(frozen=True)
@@ -69,38 +66,35 @@ def run(config: FilmConfig) -> None:
     if not 2 <= config.pictures <= 1000:
         raise BenchmarkError(f"pictures must be 2 to 1000, got {config.pictures}")
     require_file(config.out, ".webp")
-    env, params, drawn = drive_whole(config)
-    agent = "a trained policy" if Path(config.agent).exists() else config.agent
-    title = f"{env.id.split('/')[-1]}, driven by {agent}"
-    write_file(config.out, film(params, drawn, title, config.pictures))
+    drawn, radius = drive_episode(config)
+    name = "a trained policy" if Path(config.agent).exists() else config.agent
+    write_file(
+        config.out, film(drawn, radius, f"{find(config.task, short=True).split('/')[-1]}, driven by {name}", config.pictures)
+    )
     print(f"{config.out}: {drawn.trace.time[-1]:.0f} s of driving, {_end(drawn)}")
 
 
-def drive_whole(config: FilmConfig) -> tuple[TunnelEnv, EnvParams, Drawn]:
-    """Drives an episode to its end; returns what it was driven in as well."""
-    task, spatial = find(config.task, short=True), not is_planar(config.sensor)
-    plan = st.load_tunnel(config.tunnel or first_tunnel(task, spatial), solid=spatial)
-    env, params = st.make(task, tunnel=plan, sensor=config.sensor)
-    trace = drive(env, params, policies.open_agent(config.agent, env, params), config.seed)
-    piece = TASKS[task].piece if task in TASKS else None
-    shown = plan if piece is None else plan.slice(piece[0], min(piece[1], plan.length - piece[0]))
-    return env, params, draw(env, params, shown, trace)
+def drive_episode(config: FilmConfig) -> tuple[Drawn, float]:
+    """Drives the episode of the settings; returns it and the radius of the robot, m."""
+    spatial = not is_planar(config.sensor)
+    plan = st.load_tunnel(config.tunnel or first_tunnel(find(config.task, short=True), spatial), solid=spatial)
+    env, params = st.make(config.task, tunnel=plan, sensor=config.sensor)
+    agent = policies.open_agent(config.agent, env, params)
+    if piece := TASKS[env.id].piece:
+        plan = plan.slice(piece[0], min(piece[1], plan.length - piece[0]))
+    return draw(env, params, plan, drive(env, params, agent, config.seed)), float(params.vehicle.radius)
 
 
-def _end(drawn: Drawn) -> str:
-    return "success" if drawn.trace.success else "contact" if drawn.trace.contact else "no success"
-
-
-def film(params: EnvParams, drawn: Drawn, title: str, pictures: int) -> bytes:
+def film(drawn: Drawn, radius: float, title: str, pictures: int) -> bytes:
     """Draws an episode as an animated WebP.
 
     Args:
-        params: The task in its tunnel.
         drawn: The episode.
-        title: Line above the picture.
+        radius: Radius of the robot, m.
+        title: What stands above it.
         pictures: Number of pictures, evenly spread in time.
     """
-    frames = [Image.fromarray(picture) for picture in _pictures(params, drawn, title, pictures)]
+    frames = [Image.fromarray(picture) for picture in _pictures(drawn, radius, title, pictures)]
     shown = [_PICTURE] * (len(frames) - 1) + [_LAST]
     buffer = io.BytesIO()
     frames[0].save(
@@ -109,12 +103,16 @@ def film(params: EnvParams, drawn: Drawn, title: str, pictures: int) -> bytes:
     return buffer.getvalue()
 
 
-def _pictures(params: EnvParams, drawn: Drawn, title: str, count: int) -> Iterator[np.ndarray]:
+def _end(drawn: Drawn) -> str:
+    return "success" if drawn.trace.success else "contact" if drawn.trace.contact else "no success"
+
+
+def _pictures(drawn: Drawn, radius: float, title: str, count: int) -> Iterator[np.ndarray]:
     figure, (plan, strip) = plt.subplots(
         2, 1, figsize=(9.6, 4.6), dpi=84, height_ratios=(1.55, 1.0), layout="constrained"
     )
     figure.suptitle(title, fontsize=11)
-    draw_plan, draw_strip = _plan(plan, params, drawn), _strip(strip, drawn)
+    draw_plan, draw_strip = _plan(plan, drawn, radius), _strip(strip, drawn)
     for row in np.unique(np.linspace(0, len(drawn) - 1, count).astype(int)):
         draw_plan(row)
         draw_strip(row)
@@ -123,10 +121,10 @@ def _pictures(params: EnvParams, drawn: Drawn, title: str, count: int) -> Iterat
     plt.close(figure)
 
 
-def _plan(axes: Axes, params: EnvParams, drawn: Drawn) -> Any:
+def _plan(axes: Axes, drawn: Drawn, radius: float) -> Any:
     """Prepares the plan around the robot, the tunnel's direction to the right; returns what draws one row."""
-    tunnel, state, radius = params.tunnel, drawn.trace.state, float(params.vehicle.radius)
-    walls = LineCollection(list(wall_segments(tunnel)), colors=_WALL, linewidths=1.3)
+    plan, station = drawn.centreline.plan, np.asarray(drawn.trace.state.station, np.float64)
+    walls = LineCollection(list(wall_lines(drawn)), colors=_WALL, linewidths=1.3)
     axes.add_collection(walls)
     beams = LineCollection([], colors=_BEAM, linewidths=0.9, alpha=0.8)
     axes.add_collection(beams)
@@ -137,36 +135,34 @@ def _plan(axes: Axes, params: EnvParams, drawn: Drawn) -> Any:
     axes.set_xlabel("m from the robot")
     text = axes.text(0.99, 0.03, "", transform=axes.transAxes, ha="right", fontsize=9)
     goal = "" if np.isnan(drawn.goal) else f", goal {drawn.goal:.1f} m"
-    planar = params.lidar.n_beams <= _DRAWN_BEAMS
-    grid, spacing = np.asarray(tunnel.grid, np.float64), float(tunnel.spacing)
 
-    def draw(row: int) -> None:
-        node = int(np.clip(round(float(state.station[row]) / spacing), 0, len(grid) - 1))
-        along = float(np.arctan2(grid[node, 3], grid[node, 2]))
-        walls.set_transform(
-            Affine2D().translate(*-np.asarray(state.position[row], float)).rotate(-along) + axes.transData
-        )
-        ends = tips(drawn, row) @ _rotation(drawn.heading[row] - along).T
-        beams.set_segments([np.stack([np.zeros(2), end]) for end in ends] if planar else [])
+    def show(row: int) -> None:
+        tangent = plan.tangent[np.searchsorted(plan.station, station[row]).clip(max=len(plan.station) - 1)]
+        along = float(np.arctan2(tangent[1], tangent[0]))
+        walls.set_transform(Affine2D().translate(*-drawn.truth[row, :2]).rotate(-along) + axes.transData)
+        turn = _rotation(float(drawn.heading[row]) - along)
+        ends = drawn.hits[row, :, :2] @ turn.T
+        beams.set_segments([np.stack([np.zeros(2), end]) for end in ends] if len(ends) <= _FEW else [])
         hits.set_data(*ends.T)
-        front = _rotation(drawn.heading[row] - along) @ np.array([2.0 * radius, 0.0])
+        front = turn @ np.array([2.0 * radius, 0.0])
         nose.set_data([0.0, front[0]], [0.0, front[1]])
         over = f": {_end(drawn)}" if row == len(drawn) - 1 else ""
-        text.set_text(f"station {state.station[row]:.1f} m{goal}{over}")
+        text.set_text(f"station {station[row]:.1f} m{goal}{over}")
 
-    return draw
-
-
-def wall_segments(tunnel: Tunnel) -> Float[np.ndarray, "n 2 2"]:
-    """Returns start and end of all segments of the walls, tunnel frame, m."""
-    vertex = np.asarray(tunnel.box[:2]).T[:, :, None] + np.asarray(tunnel.wall)  # (blocks, 2, k)
-    return np.stack([vertex[:, :, :-1], vertex[:, :, 1:]], axis=-1).transpose(0, 2, 3, 1).reshape(-1, 2, 2)
+    return show
 
 
-def tips(drawn: Drawn, row: int) -> Float[np.ndarray, "n 2"]:
-    """Returns where the beams with a return end, in the robot's frame, m."""
-    ends = drawn.hits[row, :, :2]
-    return ends[np.isfinite(ends).all(axis=1)]
+def wall_lines(drawn: Drawn) -> list[Float[np.ndarray, "n 2"]]:
+    """Returns the walls in the plane of the LiDAR as lines, tunnel frame, m, furniture and boxes too."""
+    plan = drawn.centreline.plan
+    lining = plan.lining(plan.default_lining)
+    boxes = [_outline(box[:2], box[2:4], box[4:]) for box in drawn.boxes.astype(np.float64)]
+    return [lining.left.vertex, lining.right.vertex, *lining.furniture.reshape(-1, 2, 2), *boxes]
+
+
+def _outline(middle: np.ndarray, axis: np.ndarray, half: np.ndarray) -> Float[np.ndarray, "5 2"]:
+    corner = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1], [1, 1]]) * half
+    return middle + corner @ np.array([axis, [-axis[1], axis[0]]])
 
 
 def _rotation(angle: float) -> Float[np.ndarray, "2 2"]:
@@ -174,21 +170,21 @@ def _rotation(angle: float) -> Float[np.ndarray, "2 2"]:
 
 
 def _strip(axes: Axes, drawn: Drawn) -> Any:
-    """Prepares the errors of odometer and agent along the way; returns what draws one row."""
-    odometer, time = drawn.odometer_error, drawn.trace.time
-    agent = drawn.estimate[:, 0] - np.asarray(drawn.trace.state.station, float)
-    both = np.concatenate([odometer, agent[np.isfinite(agent)]])
+    """Prepares the errors of odometer and agent over time; returns what draws one row."""
+    agent = drawn.estimate[:, 0] - np.asarray(drawn.trace.state.station, np.float64)
+    both = np.concatenate([drawn.odometer_error, agent[np.isfinite(agent)]])
     reach = max(1.15 * float(np.abs(both).max(initial=0.0)), 1.5)
     axes.axhline(0.0, color=_TRUTH, lw=1.5, label="truth")
     (by_odometer,) = axes.plot([], [], color=_ODOMETER, lw=1.8, label="odometer")
     (by_agent,) = axes.plot([], [], color=_AGENT, lw=1.8, label="agent's estimate")
+    time = drawn.trace.time
     axes.set(xlim=(0.0, time[-1]), ylim=(-reach, reach), xlabel="s", ylabel="error of station, m")
     axes.legend(loc="upper left", ncols=3, fontsize=8, framealpha=0.9)
     axes.grid(alpha=0.3)
 
-    def draw(row: int) -> None:
+    def show(row: int) -> None:
         until = slice(0, row + 1)
-        by_odometer.set_data(time[until], odometer[until])
+        by_odometer.set_data(time[until], drawn.odometer_error[until])
         by_agent.set_data(time[until], agent[until])
 
-    return draw
+    return show
