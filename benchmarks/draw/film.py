@@ -69,7 +69,8 @@ def run(config: FilmConfig) -> None:
     drawn, radius = drive_episode(config)
     name = "a trained policy" if Path(config.agent).exists() else config.agent
     write_file(
-        config.out, film(drawn, radius, f"{find(config.task, short=True).split('/')[-1]}, driven by {name}", config.pictures)
+        config.out,
+        film(drawn, radius, f"{find(config.task, short=True).split('/')[-1]}, driven by {name}", config.pictures),
     )
     print(f"{config.out}: {drawn.trace.time[-1]:.0f} s of driving, {_end(drawn)}")
 
