@@ -2,6 +2,7 @@
 
 import functools
 import hashlib
+import os
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from subterra_jax.host.cache import cache_folder, make_writable
-from subterra_jax.native.frames import handler_of
 from subterra_jax.native.kernels import clearance_rows, scan_rows
+from subterra_jax.native.threads import API_VERSION, handler_of, sizes_of
 from subterra_jax.tunnel import CONTACT_REACH, Tunnel
 
 _config: Any = numba.core.config  # its attributes come from the environment
@@ -24,26 +25,21 @@ _alive: list[Any] = []  # machine code lives as long as the object that made it
 
 
 @functools.cache
-def _registered(name: str, work: Any, chunk: int) -> str:
+def _registered(name: str, work: Any) -> str:
     """Compile the answer to a custom call, keep it on disk, tell XLA its name, and return that.
 
     Numba numbers the files of one function in the order in which processes write them. Two processes that compile
     different versions at the same time would take the same number, and a third would run the wrong one. So each
     version of our sources, of the libraries and of the processor has its own folder.
-
-    Args:
-        name: Name of the call.
-        work: As for `handler_of`.
-        chunk: As there; about 20 µs of work or more, which is the cost of waking a thread.
     """
     folder, before = cache_folder("native") / _version(), _config.CACHE_DIR
     writable = make_writable(folder)
     _config.CACHE_DIR = str(folder) if writable else before
     try:
-        _alive.append(handler_of(work, chunk, name, cache=writable))
+        _alive.append(handler_of(work, name, cache=writable))
     finally:
         _config.CACHE_DIR = before
-    jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(_alive[-1][0].ctypes), platform="cpu")
+    jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(_alive[-1][0].ctypes), platform="cpu", api_version=0)
     return name
 
 
@@ -54,6 +50,26 @@ def _version() -> str:
     features = llvmlite.binding.get_host_cpu_features().flatten()
     machine = f"{numba.__version__} {jaxlib.__version__} {llvmlite.binding.get_host_cpu_name()} {features}"
     return hashlib.sha256(b"".join([*sources, machine.encode()])).hexdigest()[:32]
+
+
+def _call(name: str, work: Any, chunk: int, results: Any, *arguments: Any) -> Any:
+    """Call a kernel.
+
+    Args:
+        name: Its name.
+        work: As for `handler_of`.
+        chunk: Fewest rows of a thread: some 50 µs of work, or starting it does not pay.
+        results: Shapes and types of its results.
+        arguments: Arrays of 32-bit numbers; the first axis of the first counts rows.
+    """
+    rows = arguments[0].shape[0]
+    call = jax.ffi.ffi_call(_registered(name, work), results, custom_call_api_version=API_VERSION)
+    return call(sizes_of(rows, min(cores(), rows // chunk), arguments), *arguments)
+
+
+def cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def scan(
@@ -69,16 +85,14 @@ def scan(
     shape = jax.ShapeDtypeStruct((position.shape[0], len(bearing)), jnp.float32)
     turn = np.concatenate([np.cos(bearing), np.sin(bearing)]).astype(np.float32)
     limit = jnp.asarray(range_max, jnp.float32).reshape(1)
-    call = jax.ffi.ffi_call(_registered("subterra_scan", scan_rows, 32), shape)
-    return call(start, wanted.astype(jnp.int32), position, heading, tunnel.box, tunnel.wall, turn, limit)
+    rows = start, wanted.astype(jnp.int32), position, heading
+    return _call("subterra_scan", scan_rows, 64, shape, *rows, tunnel.box, tunnel.wall, turn, limit)
 
 
 def clearance(tunnel: Tunnel, position: Float[Array, "n 2"], start: Int[Array, " n"]) -> Float[Array, " n"]:
     """`gpu.clearance`."""
-    call = jax.ffi.ffi_call(
-        _registered("subterra_clearance", clearance_rows, 256), jax.ShapeDtypeStruct(position.shape[:1], jnp.float32)
-    )
-    return call(start, position, tunnel.box, tunnel.wall, np.full(1, CONTACT_REACH, np.float32))
+    shape, reach = jax.ShapeDtypeStruct(position.shape[:1], jnp.float32), np.full(1, CONTACT_REACH, np.float32)
+    return _call("subterra_clearance", clearance_rows, 1024, shape, start, position, tunnel.box, tunnel.wall, reach)
 
 
 def march(
@@ -93,5 +107,6 @@ def march(
     from subterra_jax.native.marching import march_rows  # planar tasks do not need it
 
     shapes = [jax.ShapeDtypeStruct(block.shape, kind) for kind in (jnp.float32, jnp.int32, jnp.int32)]
-    call = jax.ffi.ffi_call(_registered("subterra_march", march_rows, 128), shapes)
-    return tuple(call(origin, direction, block, limit, *arrays, np.full(1, n_x, np.int32)))
+    # The first axis of the first argument counts rays.
+    size = np.full(1, n_x, np.int32)
+    return tuple(_call("subterra_march", march_rows, 128, shapes, origin, direction, block, limit, *arrays, size))

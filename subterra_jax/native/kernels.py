@@ -11,7 +11,7 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-from subterra_jax.native.frames import argument, length, result
+from subterra_jax.native.threads import argument, result
 from subterra_jax.tunnel import GROUP, WIDTH
 
 _F, _I, _U = np.float32, np.int32, np.uint64
@@ -83,17 +83,18 @@ def _look(box, n, wall, n_vertices, low, x, y, d_x, d_y, ahead, behind, enters, 
 
 @compiled
 @no_type_check
-def scan_rows(call, begin, end):
+def scan_rows(results, operands, begin, end):
     """Take the scans `begin` to `end` of a call: start, wanted, position, heading, box, wall, turn, limit to ranges."""
-    start, wanted, position, heading = (
-        argument(call, 0).view(_I),
-        argument(call, 1).view(_I),
-        argument(call, 2),
-        argument(call, 3),
+    start, wanted = argument(operands, 0).view(_I), argument(operands, 1).view(_I)
+    position, heading, box, wall = (
+        argument(operands, 2),
+        argument(operands, 3),
+        argument(operands, 4),
+        argument(operands, 5),
     )
-    box, wall, n_vertices = argument(call, 4), argument(call, 5), _U(length(call, 5, 2))
-    turn, limit, ranges = argument(call, 6), argument(call, 7)[0], result(call, 0)
+    turn, limit = argument(operands, 6), argument(operands, 7)[0]
     n, n_beams = _U(len(box) // 10), _U(len(turn) // 2)
+    n_vertices, ranges = _U(len(wall)) // (_U(2) * n), result(results, len(start) * len(turn) // 2)
     both = n_beams % _U(2) == _U(0)  # opposite beams share a line
     n_lines = n_beams // _U(2) if both else n_beams
     enters, work = np.empty(GROUP, np.int32), np.empty(WIDTH, np.float32)
@@ -151,11 +152,12 @@ def _squared(wall, n_vertices, block, m_x, m_y, best, work, bits):
 
 @compiled
 @no_type_check
-def clearance_rows(call, begin, end):
+def clearance_rows(results, operands, begin, end):
     """Measure the clearances `begin` to `end` of a call: start, position, box, wall, reach to distances."""
-    start, position, box, wall = argument(call, 0).view(_I), argument(call, 1), argument(call, 2), argument(call, 3)
-    n_vertices, reach, distance = _U(length(call, 3, 2)), argument(call, 4)[0], result(call, 0)
-    n = _U(len(box) // 10)
+    start, position = argument(operands, 0).view(_I), argument(operands, 1)
+    box, wall, reach = argument(operands, 2), argument(operands, 3), argument(operands, 4)[0]
+    n, distance = _U(len(box) // 10), result(results, len(start))
+    n_vertices = _U(len(wall)) // (_U(2) * n)
     work = np.empty(WIDTH, np.float32)
     bits = work.view(np.int32)
     for row in range(_U(begin), _U(end)):
