@@ -1,7 +1,10 @@
 """Offsets between clocks, by turn rates: those of the LiDAR, of an IMU beside it, and of a given trajectory.
 
-The size of a turn rate is the same for everything fixed to one body, whatever the mounts. So the clock of another
-instrument is off by the lag at which its turn rates agree best with those that the LiDAR's own sweeps show.
+Turn rates of instruments on one body are the same vectors but for one rotation, that of their mounts. So the clock of
+another instrument is off by the lag at which its rates, turned as fits best, agree most with those that the LiDAR's own
+sweeps show.
+
+Source: Wahba, A Least Squares Estimate of Satellite Attitude, 1965: the best rotation, by singular values.
 """
 
 from collections.abc import Callable
@@ -11,7 +14,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
-from scipy.stats import rankdata
 
 from scene.errors import RecordingError
 from scene.poses.imu import Inertial, integrals
@@ -21,16 +23,16 @@ from scene.reading.recording import Recording
 
 NOTICED = 0.010  # s; a smaller offset is within what turn rates tell
 _SWEEPS, _FEWEST = 100, 40  # that are matched one to the next; with fewer nothing is told
-_PASSES = 2  # times that they are matched
-_POINTS = 20_000  # of a sweep
+_PASSES = 3  # times that they are matched: each unwinds sweeps by the motion that the last one found
+_POINTS = 6_000  # of a sweep
 _WARM_UP = 8  # sweeps that are left out: the map is too thin for them
 _REACH, _STEP = 1.5, 0.005  # s: largest lag that is tried, and between two lags
-_AGREE = 0.65  # correlation of turn rates from which a lag counts
-_BETTER = 0.05  # by which it must beat the correlation without a lag
-_LIVELY = 0.03  # rad/s of standard deviation; a carrier that turns more evenly tells no lag
+_AGREE = 0.8  # correlation of turn rates from which a lag counts
+_LIVELY = 0.03  # rad/s, mean size less the mean; a carrier that turns more evenly tells no lag
+_LONGEST = 3.0  # times the median size
 _OVERLAP = 0.5  # of the recording's time
 
-Turns = Callable[[Float[np.ndarray, " k"], Float[np.ndarray, " k"]], Float[np.ndarray, " k"]]
+Turns = Callable[[Float[np.ndarray, " k"], Float[np.ndarray, " k"]], Float[np.ndarray, "k 3"]]
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,7 @@ class LidarTurns:
 
     start: Float[np.ndarray, " k"]  # s
     end: Float[np.ndarray, " k"]  # s
-    rate: Float[np.ndarray, " k"]  # rad/s
+    rate: Float[np.ndarray, "k 3"]  # About the LiDAR's axes, rad/s
 
 
 def lidar_turns(recording: Recording) -> LidarTurns | None:
@@ -64,7 +66,7 @@ def lidar_turns(recording: Recording) -> LidarTurns | None:
         poses = Trajectory(np.array(times), stack[:, :3, 3], Rotation.from_matrix(stack[:, :3, :3]), "sweeps")
         guide = Guide(poses, True, np.inf, np.inf)  # a sweep is unwound by its own motion, not by that before it
     at, turns = poses.times[_WARM_UP:], poses.rotations[_WARM_UP:]
-    steps = (turns[:-1].inv() * turns[1:]).magnitude() / np.diff(at)
+    steps = (turns[:-1].inv() * turns[1:]).as_rotvec() / np.diff(at)[:, None]
     return LidarTurns(at[:-1], at[1:], steps)
 
 
@@ -73,7 +75,7 @@ def turns_of_gyro(inertial: Inertial) -> Turns:
 
     def rates(start: np.ndarray, end: np.ndarray) -> np.ndarray:
         angle = [integrals(at, inertial.times, inertial.rate) for at in (start, end)]
-        return np.linalg.norm(angle[1] - angle[0], axis=1) / (end - start)
+        return (angle[1] - angle[0]) / (end - start)[:, None]
 
     return rates
 
@@ -82,32 +84,41 @@ def turns_of_poses(poses: Trajectory) -> Turns:
     """Return the mean turn rates of a trajectory over intervals of its own clock, rad/s."""
 
     def rates(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-        return (poses.at(start)[1].inv() * poses.at(end)[1]).magnitude() / (end - start)
+        return (poses.at(start)[1].inv() * poses.at(end)[1]).as_rotvec() / (end - start)[:, None]
 
     return rates
 
 
 def find_lag(lidar: LidarTurns, other: Turns) -> float | None:
     """Return how much later the other clock shows the turns of the LiDAR, s; `None` where the turns do not tell."""
-    if lidar.rate.std() < _LIVELY:
+    own = _even(lidar.rate)
+    if float(np.linalg.norm(own, axis=1).mean()) < _LIVELY:
         return None
     lags = np.arange(-round(_REACH / _STEP), round(_REACH / _STEP) + 1) * _STEP
-    agree = np.array([_correlate(lidar.rate, other(lidar.start + lag, lidar.end + lag)) for lag in lags])
-    best, none = int(np.argmax(agree)), len(lags) // 2
+    agree = np.array([_agreement(own, _even(other(lidar.start + lag, lidar.end + lag))) for lag in lags])
+    best = int(np.argmax(agree))
     if agree[best] < _AGREE or best in (0, len(lags) - 1):
         return None
-    if agree[best] < agree[none] + _BETTER * (1.0 - agree[none]):
-        return 0.0
     before, here, after = agree[best - 1 : best + 2]
     bend = before - 2.0 * here + after
     return float(lags[best] + (0.5 * _STEP * (before - after) / bend if bend < 0 else 0.0))
 
 
-def _correlate(one: np.ndarray, other: np.ndarray) -> float:
-    """Return the correlation of the ranks: a sweep that was matched wrongly counts no more than another."""
-    one, other = (ranks - ranks.mean() for ranks in (rankdata(one), rankdata(other)))
+def _even(rate: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3"]:
+    """Return rates less their mean, a gyro's bias, none longer than thrice the usual: a wrong match counts no more."""
+    rate = rate - np.median(rate, axis=0)
+    size = np.linalg.norm(rate, axis=1, keepdims=True)
+    return rate * np.minimum(1.0, _LONGEST * np.median(size) / np.maximum(size, 1e-12))
+
+
+def _agreement(one: Float[np.ndarray, "k 3"], other: Float[np.ndarray, "k 3"]) -> float:
+    """Return the correlation of two rows of vectors after the rotation that suits them best."""
     size = float(np.linalg.norm(one) * np.linalg.norm(other))
-    return float(one @ other) / size if size > 1e-12 else 0.0
+    if size < 1e-12:
+        return 0.0
+    left, values, right = np.linalg.svd(one.T @ other)
+    values[2] *= np.sign(np.linalg.det(left) * np.linalg.det(right))
+    return float(values.sum()) / size
 
 
 @dataclass(frozen=True)
@@ -168,7 +179,7 @@ def _lag(recording: Recording, other: Turns) -> float | None:
     if lag is None:
         return None
     times = recording.convention
-    if not times.guessed or times.span < 2 * NOTICED or abs(lag + times.span) > 3 * NOTICED:
+    if not times.guessed or times.length < 2 * NOTICED or abs(lag + times.length) > 3 * NOTICED:
         return lag
     recording.take_end()
     print(f"point times {recording.facts['point_times']}", flush=True)

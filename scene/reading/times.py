@@ -6,7 +6,7 @@ clock or of another one; times that begin anew in each sweep count from the head
 it (Ouster, Livox: its start). The growth, or the span of a sweep against the time between two headers, gives the unit.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
 import numpy as np
@@ -23,10 +23,12 @@ _OVER_PERIOD, _UNSURE = 1.2, 5.0  # times the period: longest sweep; up to which
 _LEAST_SWEEP = 0.005  # of the period: a shorter sweep makes the unit unsure
 _GROWS = 0.5  # of the span of a sweep, by which the times of the next one are later: they are absolute
 _EVEN = 0.02  # s of spread about one offset between two clocks; with more the headers rule
-_WIDE = 1.5  # times the usual span from the middle of a sweep: further is no time of that sweep
+_WIDE = 1.5  # times the length of a sweep from its middle: further is no time of that sweep
 MOST_BAD = 0.05  # share of all points without a time of their sweep
 _SAMPLE = 4000  # points of a sweep by which its span is told
-_CORE, _AROUND = (0.25, 0.75), 3.0  # quartiles; of their distance, how far from the middle a time of the sweep may lie
+_MOST, _AROUND = 0.85, 3.0  # share of the points that lie about the median; how much further a time of theirs may lie
+_LONG = 0.95  # quantile of the spans of all sweeps that is the length of one: of some the first or last beams are lost
+_COUNTER = 2.0**32  # values of a counter of 32 bits
 _FLAG = tyro.conf.arg(prefix_name=False)
 
 
@@ -83,12 +85,7 @@ def make_scan(
         name: Name of their field.
     """
     good = np.isfinite(points).all(axis=1) & (points != 0).any(axis=1)
-    if values is None:
-        return RawScan(stamp, points[good])
-    if not np.issubdtype(values.dtype, np.integer):
-        values = values.astype(np.float64)
-        good &= np.isfinite(values)
-    return RawScan(stamp, points[good], values[good], name)
+    return RawScan(stamp, points[good], None if values is None else values[good], name)
 
 
 @dataclass(frozen=True)
@@ -98,11 +95,11 @@ class Convention:
     kind: Literal["static", "after", "same clock", "other clock"]
     words: str  # For people, with the evidence
     scale: float = 1.0  # s
-    span: float = _LONGEST_SWEEP  # Usual span of a sweep, s
-    reference: Literal["start", "end"] | None = None  # Part of a sweep that its header is of, where the user says so
+    length: float = _LONGEST_SWEEP  # Of a sweep, s
+    reference: Literal["start", "end"] | None = None  # Part of a sweep that its header is of, where somebody says so
     guessed: bool = False  # True where nothing tells whether a header is of the start or the end of its sweep
-    offset: float = 0.0  # Of the headers' clock before the points', s
-    even: bool = True  # True where that offset is one; else each header tells its own
+    offset: float | None = None  # Of the headers' clock before the points', s; `None` where each header tells its own
+    round: float = np.inf  # Time after which the points' clock begins anew, s
     by_receipt: bool = False  # True where the headers say nothing and the time of recording stands for them
 
     def apply(self, raw: RawScan) -> tuple[Scan, int]:
@@ -111,32 +108,31 @@ class Convention:
         if raw.values is None or self.kind == "static":
             return Scan(stamp, raw.points, np.zeros(len(raw.points))), 0
         values, good = _unwrap(raw.values)
-        if not len(values):
-            return Scan(stamp, raw.points, np.zeros(0)), 0
-        middle = np.median(values[good])
-        good &= np.abs(values - middle) * self.scale <= _WIDE * self.span
+        if not good.any():
+            return Scan(stamp, raw.points[:0], np.zeros(0)), len(good)
+        good &= np.abs(values - np.median(values[good])) * self.scale <= _WIDE * self.length
         points, values = raw.points[good], values[good]
-        start, times = self._place(stamp, values)
+        start, times = self._place(stamp, values * self.scale)
         if (np.diff(times) < 0).any():
             order = np.argsort(times, kind="stable")
             points, times = points[order], times[order]
         return Scan(start, points, times), int((~good).sum())
 
-    def _place(self, stamp: float, values: Float[np.ndarray, " n"]) -> tuple[float, Float[np.ndarray, " n"]]:
-        """Return the start of a sweep, s, and times after it, s."""
-        low = float(values.min())
+    def _place(self, stamp: float, times: Float[np.ndarray, " n"]) -> tuple[float, Float[np.ndarray, " n"]]:
+        """Return the time from which a sweep is counted, and times after it, s."""
+        low = float(times.min())
+        begin = stamp - (self.length if self.reference == "end" else 0.0)
         if self.kind == "after":
-            times = values * self.scale
-            shift = min(low * self.scale, 0.0)
-            if self.reference is None or (self.reference == "start" and low >= 0):
-                return stamp + shift, times - shift
-            return stamp - (float(times.max()) if self.reference == "end" else 0.0), times - shift
-        times = (values - low) * self.scale
+            shift = min(low, 0.0)
+            return (begin if self.reference == "end" else stamp + shift), times - shift
+        times = times - low
         if self.kind == "same clock":
-            return low * self.scale, times
-        if self.even:
-            return low * self.scale + self.offset, times
-        return stamp - (float(times.max()) if self.reference == "end" else 0.0), times
+            return low, times
+        if self.offset is None:
+            return begin, times
+        start = low + self.offset
+        rounds = np.rint((stamp - start) / self.round) * self.round if np.isfinite(self.round) else 0.0
+        return start + float(rounds), times
 
 
 def _unwrap(values: Shaped[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
@@ -144,15 +140,20 @@ def _unwrap(values: Shaped[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], 
 
     A few values across that end are no sign of it: an underflow made them.
     """
-    times, good = values.astype(np.float64), np.ones(len(values), bool)
-    if values.dtype.kind == "u" and values.dtype.itemsize == 4 and len(values):
+    times = values.astype(np.float64)
+    good = np.isfinite(times)
+    if _counts_32(values) and len(values):
         ahead = times - np.median(times)
-        early, late = ahead < -(2.0**31), ahead > 2.0**31
+        early, late = ahead < -0.5 * _COUNTER, ahead > 0.5 * _COUNTER
         if (early | late).mean() > MOST_BAD:
-            times = times + 2.0**32 * early - 2.0**32 * late
+            times = times + _COUNTER * early - _COUNTER * late
         else:
             good = ~(early | late)
     return times, good
+
+
+def _counts_32(values: Shaped[np.ndarray, " n"]) -> bool:
+    return values.dtype.kind == "u" and values.dtype.itemsize == 4
 
 
 @dataclass
@@ -161,9 +162,9 @@ class Spans:
 
     name: str = ""
     unit: str | None = None
+    wraps: bool = False  # True where the times are a counter of 32 bits
     rows: list[tuple[float, float, float, float]] = field(default_factory=list)  # header, receipt, s; first, last value
     timed: list[int] = field(default_factory=list)  # Number of each sweep with times, among all
-    count: int = 0  # Sweeps
     points: int = 0  # In all of them
 
     def add(self, raw: RawScan) -> None:
@@ -171,13 +172,13 @@ class Spans:
         if raw.values is not None and len(raw.values):
             values, good = _unwrap(raw.values[:: max(1, len(raw.values) // _SAMPLE)])
             if good.any():
-                core = np.quantile(values[good], _CORE)
-                inside = values[good & (np.abs(values - core.mean()) <= _AROUND * np.ptp(core))]
+                apart = np.abs(values[good] - np.median(values[good]))
+                inside = values[good][apart <= _AROUND * np.quantile(apart, _MOST)]
                 low, high = float(inside.min()), float(inside.max())
             self.name, self.unit = self.name or raw.name, self.unit or raw.unit
-            self.timed.append(self.count)
+            self.wraps = _counts_32(raw.values)
+            self.timed.append(len(self.rows))
         self.rows.append((raw.stamp, raw.received, low, high))
-        self.count += 1
         self.points += len(raw.points)
 
     def decide(self, told: TimeConfig, why: str = "by flag") -> Convention:
@@ -189,60 +190,62 @@ class Spans:
         by_receipt = _headers_repeat(table)
         stamp = table[:, 1] if by_receipt else table[:, 0]
         note = "; headers repeat, so the time of recording stands for them" if by_receipt else ""
-        if not self.timed or told.time_unit == "none":
+        rows = np.array(self.timed, np.intp)
+        rows = rows[np.isfinite(table[rows, 2])]
+        if not len(rows) or told.time_unit == "none":
             return Convention("static", STATIC + note, by_receipt=by_receipt)
-        rows = np.array(self.timed)
         stamp, low, high = stamp[rows], table[rows, 2], table[rows, 3]
-        span = float(np.nanmedian(high - low))
-        if span == 0.0 or np.mean(high == low) > 0.5:
-            which = "0 throughout" if not np.nanmax(np.abs(high)) else "one value in each sweep"
+        spans = high - low
+        span = float(np.median(spans))
+        if span == 0.0 or np.mean(spans == 0.0) > 0.5:
+            which = "0 throughout" if not np.abs(high).max() else "one value in each sweep"
             return Convention("static", f"`{self.name}` is {which}: every sweep is taken as static{note}",
                               by_receipt=by_receipt)  # fmt: skip
-        period = _usual_step(stamp)
-        unit = told.time_unit or self.unit
-        if _is_absolute(stamp, low, span):
-            found = self._decide_absolute(stamp, low, span, period, unit, told)
-        else:
-            found = self._decide_relative(low, high, span, period, unit, told)
+        decide = self._decide_absolute if _is_absolute(stamp, low, span) else self._decide_relative
+        found = decide(stamp, low, high, told)
         by = f" ({why})" if told.time_unit or told.time_stamp else ""
-        return Convention(**{**vars(found), "words": found.words + by + note, "by_receipt": by_receipt})
+        length = max(float(np.quantile(spans, _LONG)) * found.scale, 1e-9)
+        return replace(found, words=found.words + by + note, by_receipt=by_receipt, length=length)
 
-    def _decide_relative(
-        self, low: np.ndarray, high: np.ndarray, span: float, period: float, unit: str | None, told: TimeConfig
-    ) -> Convention:
-        unit = unit or self._unit_of_span(span, float(np.nanmax(np.maximum(high, -low))), period)
+    def _decide_relative(self, stamp: np.ndarray, low: np.ndarray, high: np.ndarray, told: TimeConfig) -> Convention:
+        span, period = float(np.median(high - low)), _usual_step(stamp)
+        unit = told.time_unit or self.unit
+        unit = unit or self._unit_of_span(span, float(np.maximum(high, -low).max()), period)
         scale = _UNITS[unit]
         side, guessed = "after the stamp (its start)", self.unit is None and told.time_stamp is None
-        if float(np.nanmedian(-low)) > float(np.nanmedian(high)):
+        if float(np.median(-low)) > float(np.median(high)):
             side, guessed = "before the stamp (its end)", False
         if told.time_stamp is not None:
             side = f"from its start; the stamp is its {told.time_stamp}"
         evidence = f"; sweeps of {span * scale:.3g} s" + (f", {period:.3g} s apart" if np.isfinite(period) else "")
         words = f"`{self.name}`, {_shown(unit)} {side}{evidence}"
-        return Convention("after", words, scale, max(span * scale, 1e-9), told.time_stamp, guessed)
+        return Convention("after", words, scale, reference=told.time_stamp, guessed=guessed)
 
-    def _decide_absolute(
-        self, stamp: np.ndarray, low: np.ndarray, span: float, period: float, unit: str | None, told: TimeConfig
-    ) -> Convention:
-        if unit is None:
-            unit = self._unit_of_growth(stamp, low)
+    def _decide_absolute(self, stamp: np.ndarray, low: np.ndarray, high: np.ndarray, told: TimeConfig) -> Convention:
+        unit = told.time_unit or self.unit or self._unit_of_growth(stamp, low)
         scale = _UNITS[unit]
+        round = _COUNTER * scale if self.wraps else np.inf
         ahead = stamp - low * scale
-        offset = float(np.nanmedian(ahead))
-        spread = float(np.nanmedian(np.abs(ahead - offset)))
-        length = f"sweeps of {span * scale:.3g} s"
-        if abs(offset) < _SAME_CLOCK and np.nanmedian(low) * scale > _FIRST_EPOCH and told.time_stamp is None:
+        if self.wraps:
+            ahead -= round * np.rint((ahead - ahead[0]) / round)
+        offset = float(np.median(ahead))
+        even = float(np.median(np.abs(ahead - offset))) < _EVEN
+        length = f"sweeps of {np.median(high - low) * scale:.3g} s"
+        if abs(offset) < _SAME_CLOCK and np.median(low) * scale > _FIRST_EPOCH and told.time_stamp is None:
             words = f"`{self.name}`, absolute, {_shown(unit)}; {length}, {offset:+.3g} s from the headers"
-            return Convention("same clock", words, scale, span * scale)
-        even, reference = spread < _EVEN, told.time_stamp or "start"
+            return Convention("same clock", words, scale)
+        reference = told.time_stamp or "start"
         rule = f"{offset:.9g} s behind the headers" if even else "each header tells when its sweep began"
         words = (
             f"`{self.name}`, absolute by another clock, {_shown(unit)}; {length}, {rule}; a header is taken for the "
             f"{reference} of its sweep"
         )
-        offset -= span * scale if reference == "end" else 0.0
-        guessed = told.time_stamp is None
-        return Convention("other clock", words, scale, span * scale, reference, guessed, offset, even)
+        if reference == "end":
+            offset -= float(np.quantile(high - low, _LONG)) * scale
+        return Convention(
+            "other clock", words, scale, reference=reference, guessed=told.time_stamp is None,
+            offset=offset if even else None, round=round,
+        )  # fmt: skip
 
     def _unit_of_span(self, span: float, largest: float, period: float) -> str:
         """Return the unit in which sweeps are as long as the time between two allows."""
@@ -268,7 +271,7 @@ class Spans:
         """Return the unit in which the times grow as the headers do; of few sweeps, that which makes them times."""
         steps = np.diff(stamp) > 0
         if steps.any():
-            growth = float(np.nanmedian(np.diff(low)[steps] / np.diff(stamp)[steps]))
+            growth = float(np.median(np.diff(low)[steps] / np.diff(stamp)[steps]))
             for name, scale in _UNITS.items():
                 if 0.5 < growth * scale < 2.0:
                     return name
@@ -276,7 +279,7 @@ class Spans:
                 f"has times in `{self.name}` that grow by {growth:.3g} in a second of the headers: by no unit; "
                 "--time-unit says which, or none"
             )
-        first, at = float(np.nanmedian(low)), float(np.nanmedian(stamp))
+        first, at = float(np.median(low)), float(np.median(stamp))
         near = [name for name, scale in _UNITS.items() if abs(first * scale - at) < _SAME_CLOCK]
         since = [name for name, scale in reversed(_UNITS.items()) if first * scale > _FIRST_EPOCH]
         return (near + since + ["s"])[0]
@@ -299,7 +302,7 @@ def _usual_step(stamp: Float[np.ndarray, " n"]) -> float:
 def _is_absolute(stamp: np.ndarray, low: np.ndarray, span: float) -> bool:
     """Return whether times go on from sweep to sweep; of a single sweep, whether they are far above their span."""
     if len(low) > 1:
-        return bool(np.nanmedian(np.diff(low)) > _GROWS * span)
+        return bool(np.median(np.diff(low)) > _GROWS * span)
     scales = np.array(list(_UNITS.values()))
     near = (np.abs(low[0] * scales - stamp[0]) < _SAME_CLOCK) & (low[0] * scales > _FIRST_EPOCH)
     return bool(near.any() or low[0] > _FIRST_EPOCH)

@@ -7,6 +7,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+from scene.survey.conventions import Convention
+
 LidarName = Literal["avia", "vlp16", "os1"]
 TruthName = Literal[
     "paper", "metro", "ellipse", "widening", "horseshoe", "s-bend", "grade", "irregular", "circle",
@@ -63,6 +65,8 @@ class SurveyConfig:
     cloud: bool = False
     # Errors of the instruments. Zero, or the flag's `no-` form, switches a part off.
     errors: SensorErrors = field(default_factory=SensorErrors)
+    # Conventions of drivers that the recordings are written in.
+    convention: Convention = field(default_factory=Convention)
 
 
 def check_survey(config: SurveyConfig) -> None:
@@ -90,6 +94,7 @@ def check_survey(config: SurveyConfig) -> None:
     if config.cloud and not config.sensors:
         raise ValueError("cloud needs a sensor, got none")
     _check_errors(config.errors)
+    config.convention.check()
     # The nearest existing parent decides whether the folder can be made.
     for folder in (config.out, *config.out.parents):
         if folder.exists():

@@ -100,7 +100,7 @@ def imu_messages(
     return [row.tobytes() for row in rows]
 
 
-_CODES = {"u1": 2, "u2": 4, "u4": 6, "f4": 7}
+_CODES = {"u1": 2, "u2": 4, "u4": 6, "f4": 7, "f8": 8}  # sensor_msgs/PointField
 # velodyne_pointcloud's PointXYZIRT, packed: 22 bytes.
 VELODYNE_POINT = np.dtype([
     ("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("ring", "<u2"), ("time", "<f4"),
@@ -115,14 +115,15 @@ OUSTER_POINT = np.dtype({
 _SIGNAL = 1e4  # photons of an echo of 1 % at 1 m; only ratios of it mean anything
 
 
-def _message(seq: int, stamp: int, frame: bytes, rows: int, points: np.ndarray, dense: bool) -> bytes:
-    """Return a PointCloud2 of `rows` rows, stamped `stamp` ns after the start of the survey."""
+def encode_cloud(seq: int, stamp: int, frame: bytes, rows: int, points: np.ndarray, dense: bool) -> bytes:
+    """Serialises records as a PointCloud2 of `rows` rows, stamped `stamp` ns after the start of the survey."""
     layout, width = points.dtype, len(points) // rows
     fields = dict(layout.fields or {})
     out = make_header(seq, stamp, frame) + struct.pack("<III", rows, width, len(fields))
     for name, (kind, offset, *_) in fields.items():
         out += struct.pack("<I", len(name)) + name.encode() + struct.pack("<IBI", offset, _CODES[kind.str[1:]], 1)
-    out += struct.pack("<?III", False, layout.itemsize, layout.itemsize * width, layout.itemsize * len(points))
+    big = any(kind.byteorder == ">" for kind, *_ in fields.values())
+    out += struct.pack("<?III", big, layout.itemsize, layout.itemsize * width, layout.itemsize * len(points))
     return out + points.tobytes() + struct.pack("<?", dense)
 
 
@@ -135,7 +136,7 @@ def velodyne_message(sweep: Sweep, lidar: Lidar) -> bytes:
     points["intensity"] = np.rint(sweep.reflectivity[seen] / 1.5)
     points["ring"] = lidar.line[seen]
     points["time"] = 1e-9 * (sweep.offset - lidar.stamp)[seen]
-    return _message(sweep.number, sweep.begin + lidar.stamp, b"velodyne", 1, points, dense=True)
+    return encode_cloud(sweep.number, sweep.begin + lidar.stamp, b"velodyne", 1, points, dense=True)
 
 
 def ouster_message(sweep: Sweep, lidar: Lidar) -> bytes:
@@ -154,4 +155,4 @@ def ouster_message(sweep: Sweep, lidar: Lidar) -> bytes:
     points["range"] = np.rint(1e3 * distance)
     points["reflectivity"] = np.rint(reflectivity)
     points["intensity"] = np.rint(_SIGNAL * reflectivity / np.where(distance > 0.0, distance, 1.0) ** 2)
-    return _message(sweep.number, sweep.begin + lidar.stamp, b"os_sensor", rings, points, dense=False)
+    return encode_cloud(sweep.number, sweep.begin + lidar.stamp, b"os_sensor", rings, points, dense=False)

@@ -3,12 +3,12 @@
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from rich.console import Console
 from rich.progress import Progress
-from rosbags.rosbag1 import Writer
 
 from scene.survey import messages
 from scene.survey.bore import Bore, draw_bore
@@ -25,6 +25,7 @@ from scene.survey.carrier import (
 )
 from scene.survey.cast import Caster, n_sweeps, sweeps
 from scene.survey.config import LidarName, SurveyConfig
+from scene.survey.conventions import Convention, Recorder, encode, kind_of
 from scene.survey.given import GivenBore, describe_given, read_given
 from scene.survey.lidar import SCAN_PERIOD, Lidar, Sweep, avia, os1, vlp16
 from scene.survey.mesh import Mesh
@@ -46,7 +47,15 @@ class Device:
 
 
 def make_device(name: LidarName, config: SurveyConfig) -> Device:
-    """Return the device called `name`."""
+    """Return the device called `name`, with the convention's messages; raises `ValueError` where it has none."""
+    own, convention = _own_device(name, config), config.convention
+    kind = kind_of(convention, own.kind)
+    if convention.point_times == "driver":
+        return own
+    return replace(own, kind=kind, encode=partial(encode, convention=convention))
+
+
+def _own_device(name: LidarName, config: SurveyConfig) -> Device:
     if name == "avia":
         return Device(avia(config.point_rate), "", "/livox/lidar", messages.CUSTOM_TYPE, messages.custom_message)
     if name == "vlp16":
@@ -63,38 +72,48 @@ def draw_imu_messages(
         sample = measure_inertial(np.random.default_rng(seed), carried, one.rate, one.mount, config.errors)
         at = np.rint(sample.time * 1e9).astype(np.int64)
         accel = sample.accel / (GRAVITY if one.in_g else 1.0)
-        raw = messages.imu_messages(one.frame, at, sample.quaternion if one.orientation else None, sample.gyro, accel)
+        stamp = at + round(1e9 * config.convention.imu_late)
+        raw = messages.imu_messages(
+            one.frame, stamp, sample.quaternion if one.orientation else None, sample.gyro, accel
+        )
         out += [(int(t), one.topic, m) for t, m in zip(at, raw, strict=True)]
     return sorted(out, key=lambda m: m[:2])
 
 
 def write_recording(
-    path: Path, device: Device, sweeps: Iterable[Sweep], inertial: list[Message], cloud: CloudWriter | None
-) -> int:
-    """Writes the bag, and the returns to `cloud` if asked; returns the number of returns.
+    path: Path,
+    device: Device,
+    sweeps: Iterable[Sweep],
+    inertial: list[Message],
+    cloud: CloudWriter | None = None,
+    convention: Convention = Convention(),  # noqa: B008 (frozen)
+    count: int = 0,
+) -> tuple[Path, int]:
+    """Writes the recording of `count` sweeps, and the returns to `cloud` if asked; returns its path and their number.
 
     A message is recorded when it is complete: a sweep one period after its first point. Sweeps and IMU messages come in
     the order of time.
     """
     returns, waiting = 0, iter([*inertial, (2**62, "", b"")])
     kinds = {topic: messages.IMU_TYPE for _, topic, _ in inertial} | {device.topic: device.kind}
-    with ExitStack() as stack:
-        bag = stack.enter_context(Writer(stack.enter_context(replace_file(path))))
-        topics = {name: bag.add_connection(name, kinds[name], typestore=messages.STORE) for name in sorted(kinds)}
+    starts = {k * count // convention.bags for k in range(1, convention.bags)}
+    with Recorder(path, kinds, convention) as bag:
         at, topic, raw = next(waiting)
-        for sweep in sweeps:
+        for number, sweep in enumerate(sweeps):
+            if number in starts:
+                bag.start_part()
             end = sweep.begin + round(SCAN_PERIOD * 1e9)
             while at < end:
-                bag.write(topics[topic], messages.unix_nanoseconds(at), raw)
+                bag.write(topic, at, raw)
                 at, topic, raw = next(waiting)
-            bag.write(topics[device.topic], messages.unix_nanoseconds(end), device.encode(sweep, device.lidar))
+            bag.write(device.topic, end, device.encode(sweep, device.lidar))
             returns += int(sweep.valid.sum())
             if cloud:
                 cloud.add(sweep.placed[sweep.valid], sweep.reflectivity[sweep.valid])
         while topic:
-            bag.write(topics[topic], messages.unix_nanoseconds(at), raw)
+            bag.write(topic, at, raw)
             at, topic, raw = next(waiting)
-    return returns
+    return bag.path, returns
 
 
 TRUTH_RATE = 200.0  # Hz, rows of groundtruth.tum
@@ -150,5 +169,6 @@ def _simulate_device(
         progress = stack.enter_context(Progress(console=console, transient=True))
         tracked = progress.track(seen, total=count, description=f"survey, {name}")
         bag = config.out / f"survey{one.suffix}.bag"
-        returns = write_recording(bag, one, tracked, draw_imu_messages(of_imus, name, carried, config), cloud)
+        inertial = draw_imu_messages(of_imus, name, carried, config)
+        _, returns = write_recording(bag, one, tracked, inertial, cloud, config.convention, count)
     return f"{name}: {count} scans, {returns} returns"
