@@ -20,12 +20,13 @@ import tyro
 
 from scene.cleaning.clean import clean_cloud
 from scene.cleaning.crop import crop_cloud, describe_chainage, keep_stations, turn_round
-from scene.config import BuildConfig, ReconstructConfig, check_number, check_settings
+from scene.config import BuildConfig, ReconstructConfig, check_settings
 from scene.errors import FitError, RecordingError, require_input
 from scene.fitting.assemble import describe_bore, fit_unfolded
 from scene.fitting.lining import add_lining
 from scene.fitting.rings import fit_ring_survey
 from scene.fitting.trackseen import find_track, measure_gauge
+from scene.inputs import hash_inputs
 from scene.judging.judge import Judgement, JudgingConfig, judge_bore, require_trust
 from scene.judging.page import render_page
 from scene.judging.returns import track_zone
@@ -36,7 +37,6 @@ from scene.progress import Stages
 from scene.reading.formats import describe, detect
 from scene.reading.ringsurvey import read_ring_survey
 from scene.reading.tables import told_columns
-from scene.resume import Partial, hash_inputs, partial_folder
 from scene.writing.folder import Reconstruction, write_folder
 from scene.writing.track import Track, describe_track, lay_track
 from subterra_jax.host.command import parse, run_command
@@ -53,7 +53,6 @@ def build(
     config: BuildConfig | None = None,
     control: Path | None = None,
     calibration: str | None = None,
-    partial: Partial | None = None,
     reader: str | None = None,
     more: tuple[Path, ...] = (),
 ) -> Reconstruction:
@@ -66,7 +65,6 @@ def build(
         config: Settings; the defaults where not given.
         control: Positions for a bag, TUM.
         calibration: See `scene.poses.calibration.find_calibration`.
-        partial: Place for partial results; beside `out` where not given.
         reader: File or module that registers a reader of the user's own.
         more: Further bags of the same recording.
 
@@ -77,15 +75,13 @@ def build(
     name = config.name or out.name
     require_folder(out)
     check_settings(config)
-    check_number("keep-every", 0.0 if partial is None else partial.every)
     mounts = find_calibration(calibration)
     if reader is not None:
         load_module(reader)
     started = time.monotonic()
-    partial = partial or Partial(partial_folder(out))
     try:
         with Stages() as progress:
-            result = reconstruct(source, trajectory, config.reconstruct, progress, control, mounts, partial, more)
+            result = reconstruct(source, trajectory, config.reconstruct, progress, control, mounts, more)
             _print_time(started, f"bore: {result.bore.length:.2f} m, {result.facts['kind']}")
             print(_describe_stations(result), flush=True)
             with _naming(source):
@@ -95,15 +91,11 @@ def build(
                 with replace_folder(out) as folder:
                     write_folder(folder, name, result, track, judgement, config)
             _print_time(started, f"scene: written and compiled by MuJoCo {mujoco.__version__}")
-        partial.discard()
         _page_of_refusal(out).unlink(missing_ok=True)  # of an earlier try
-    except (RecordingError, FitError) as error:
-        partial.discard()  # the input is at fault, and would be again
-        if isinstance(error, FitError) and error.page:
+    except FitError as error:
+        if error.page:
             raise _leave_page(error, out) from error
         raise
-    finally:
-        partial.close()
     print(judgement.summary(), flush=True)
     laid = describe_track(track, result.seen)["laid"]
     print(f"track: {laid}" + ("; --track standard lays one" if "no rails" in laid else ""), flush=True)
@@ -120,20 +112,18 @@ def reconstruct(
     progress: Stages,
     control: Path | None = None,
     calibration: Calibration = UNCALIBRATED,
-    partial: Partial | None = None,
     more: tuple[Path, ...] = (),
 ) -> Reconstruction:
     """Detects the kind of an input, of any format that `scene.reading.formats` knows, and builds its bore.
 
-    Takes what `build` takes; no partial results are kept without `partial`.
+    Takes what `build` takes.
 
     Raises:
         RecordingError: Unreadable, or of no known kind.
         FitError: No tunnel in it.
     """
-    partial = partial or Partial(None)
     detected = detect(require_input(source), config.reading.format)
-    kind, path, parts = detected.format.kind, detected.path, (config.voxel, config.reading, progress, partial)
+    kind, path, parts = detected.format.kind, detected.path, (config.voxel, config.reading, progress)
     for given, what in ((trajectory, "a trajectory"), (control, "control")):
         if given is not None and kind != "recording":
             raise RecordingError(f"{given}: {what} goes with a bag, but {source} is none")
@@ -276,8 +266,6 @@ def command(
     control: Path | None = None,
     calibration: str | None = None,
     reader: str | None = None,
-    fresh: bool = False,
-    keep_every: float = 5.0,
     config: Annotated[BuildConfig, tyro.conf.arg(name="")] = _DEFAULT,
 ) -> Callable[[], Reconstruction]:
     """Builds a scene from a recording.
@@ -293,12 +281,9 @@ def command(
         control: Positions of a prism in TUM form that fix odometry's length.
         calibration: Mounts of prism and IMU: geode-gamma, a YAML file, or the prism's x,y,z, m.
         reader: Python file or module of your own that registers a reader.
-        fresh: Start over, whatever a killed build got done.
-        keep_every: Least time between two partial results, s.
         config: Settings.
     """
-    results = Partial(partial_folder(out), fresh, keep_every)
-    return partial(build, source, out, trajectory, config, control, calibration, results, reader, more)
+    return partial(build, source, out, trajectory, config, control, calibration, reader, more)
 
 
 def main() -> int:
@@ -314,7 +299,7 @@ def main() -> int:
             except FitError as error:
                 raise error.about(f"{error} [{error.code}]" if error.code else str(error)) from error
 
-    return run_command(act, "interrupted; the output is as it was, and the same command goes on from here")
+    return run_command(act, "interrupted; the output is as it was")
 
 
 if __name__ == "__main__":

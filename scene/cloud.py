@@ -80,26 +80,6 @@ class VoxelMean:
         points = (sums[:, :3] / weights[:, None]).astype(np.float32)
         return Cloud(points, weights.astype(np.float32), self._origin, self.returns, self.voxel)
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        """Return the state as arrays, from which another process can go on.
-
-        The parts are kept as they are: merging them now would change the order of later sums, and with it the bytes.
-        """
-        origin = np.full(3, np.nan) if self._origin is None else self._origin
-        result = {"origin": origin, "counts": np.array([self.finite, self.returns, self._pending])}
-        for index, (key, sums) in enumerate(self._parts):
-            result |= {f"key{index}": key, f"sums{index}": sums}
-        return result
-
-    @classmethod
-    def restored(cls, voxel: float, arrays: dict[str, np.ndarray]) -> "VoxelMean":
-        again = cls(voxel)
-        again._origin = None if np.isnan(arrays["origin"]).any() else arrays["origin"]
-        again.finite, again.returns, again._pending = (int(count) for count in arrays["counts"])
-        count = sum(name.startswith("key") for name in arrays)
-        again._parts = [(arrays[f"key{index}"], arrays[f"sums{index}"]) for index in range(count)]
-        return again
-
     def _compact(self) -> None:
         if len(self._parts) > 1:
             keys, sums = zip(*self._parts, strict=True)

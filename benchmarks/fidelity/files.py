@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from scene.resume import input_record
+from scene.inputs import input_record
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.host.files import replace_file
 

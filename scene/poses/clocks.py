@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from scene.errors import RecordingError
 from scene.poses.imu import Inertial, integrals
@@ -62,8 +61,7 @@ def lidar_turns(recording: Recording) -> LidarTurns | None:
             if not times or middle > times[-1]:
                 tracker.register(scan, middle, guide)
                 times.append(middle)
-        stack = np.stack(tracker.poses)
-        poses = Trajectory(np.array(times), stack[:, :3, 3], Rotation.from_matrix(stack[:, :3, :3]), "sweeps")
+        poses = tracker.trajectory(times, "sweeps")
         guide = Guide(poses, True, np.inf, np.inf)  # a sweep is unwound by its own motion, not by that before it
     at, turns = poses.times[_WARM_UP:], poses.rotations[_WARM_UP:]
     steps = (turns[:-1].inv() * turns[1:]).as_rotvec() / np.diff(at)[:, None]

@@ -3,12 +3,9 @@
 In a bore a sweep barely constrains its place along the axis, and plain registration then jumps about. Each result is
 therefore blended with the expected pose by the information of both: where the walls say little, the expectation
 stands. It comes from a guide (a gyro, or an earlier trajectory), else from going on as before.
-
-The map of small-gicp cannot be read back, but it follows from the thinned sweeps and their poses. These are kept among
-the partial results, and an odometry that goes on puts them into a new map without registering them again.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import small_gicp
@@ -19,9 +16,8 @@ from scene.errors import FitError
 from scene.poses.registration import deskew
 from scene.poses.trajectory import Trajectory
 from scene.progress import Stage
-from scene.reading.recording import START, ReadPosition, Recording
+from scene.reading.recording import Recording
 from scene.reading.times import Scan
-from scene.resume import Partial
 
 LIBRARY = "small-gicp"
 MIN_POINTS = 100
@@ -48,11 +44,9 @@ class Tracker:
 
     Attributes:
         poses: Sweep to map, Pose of each, `(4, 4)`.
-        thinned: The last sweep's points as they went into the map, m, `(k, 3)`: what `follow` needs of it.
     """
 
     def __init__(self) -> None:
-        self.thinned: Float[np.ndarray, "k 3"] = np.empty((0, 3))
         self.poses: list[np.ndarray] = []
         self._map = small_gicp.GaussianVoxelMap(_VOXEL)
         self._map.set_lru(horizon=_HORIZON, clear_cycle=10)
@@ -75,15 +69,13 @@ class Tracker:
             if result.num_inliers >= MIN_POINTS and np.isfinite(result.T_target_source).all():
                 weakest = _weakest_direction(result.H)
                 pose = _blend_poses(result, pose, *self._sigmas(guide))
-        self.thinned = np.asarray(source.points())[:, :3]
         self._accept(source, pose, middle)
         return weakest
 
-    def follow(self, thinned: Float[np.ndarray, "k 3"], pose: Float[np.ndarray, "4 4"], middle: float) -> None:
-        """Adds a sweep whose pose is known from an earlier run: leaves exactly the state that `register` left then."""
-        source = small_gicp.PointCloud(thinned)
-        small_gicp.estimate_covariances(source, num_neighbors=_NEIGHBOURS, num_threads=1)
-        self._accept(source, pose, middle)
+    def trajectory(self, times: list[float], source: str) -> Trajectory:
+        """Return the poses of all sweeps, of whose middles `times`, s, are."""
+        stack = np.stack(self.poses)
+        return Trajectory(np.array(times), stack[:, :3, 3], Rotation.from_matrix(stack[:, :3, :3]), source)
 
     def _accept(self, source: small_gicp.PointCloud, pose: np.ndarray, middle: float) -> None:
         if source.size() >= MIN_POINTS or not self.poses:
@@ -153,78 +145,6 @@ def _blend_poses(
     return pose @ _pose_matrix(Rotation.from_rotvec(part[:3]), part[3:])
 
 
-@dataclass
-class TrackedSweeps:
-    """Sweeps in the order of time."""
-
-    times: list[float] = field(default_factory=list)  # Middle of each, s
-    poses: list[np.ndarray] = field(default_factory=list)  # Pose of each, `(4, 4)`
-    weakest: list[np.ndarray] = field(default_factory=list)  # Direction that each says least about; see `Odometry`
-    # Points of each as they went into the map, m; only of those that were read back
-    thinned: list[np.ndarray] = field(default_factory=list)
-    position: ReadPosition = START  # Position up to which the recording has been read
-    done: bool = False  # True where the whole recording has been read
-
-
-class OdometryLog:
-    """The pieces of one odometry among the partial results."""
-
-    def __init__(self, partial: Partial, name: str) -> None:
-        self._partial, self._name = partial, name
-        self._pieces = self._written = 0
-        self._fresh: list[np.ndarray] = []
-
-    def read(self) -> TrackedSweeps:
-        """Reads all whole pieces from the first on."""
-        tracked = TrackedSweeps()
-        while not tracked.done:
-            piece = self._partial.load(f"{self._name}-{self._pieces:04d}")
-            if piece is None or int(piece["start"]) != len(tracked.times):
-                break  # the next piece must go on where the last one ended
-            tracked.times.extend(float(time) for time in piece["times"])
-            tracked.poses.extend(piece["poses"])
-            tracked.weakest.extend(piece["weakest"])
-            tracked.thinned.extend(np.split(piece["points"], np.cumsum(piece["sizes"])[:-1]))
-            tracked.position = ReadPosition.from_array(piece["place"])
-            tracked.done = bool(piece["done"])
-            self._pieces += 1
-        self._written = len(tracked.times)
-        return tracked
-
-    def add(
-        self, tracked: TrackedSweeps, time: float, pose: np.ndarray, weakest: np.ndarray, thinned: np.ndarray
-    ) -> None:
-        """Appends one sweep; its points are only held until they are written."""
-        tracked.times.append(time)
-        tracked.poses.append(pose)
-        tracked.weakest.append(weakest)
-        if self._partial.keeps:
-            self._fresh.append(thinned.copy())
-
-    def due(self) -> bool:
-        """Return whether it is time to write."""
-        return self._partial.due()
-
-    def write(self, tracked: TrackedSweeps, position: ReadPosition, done: bool = False) -> None:
-        """Writes what has been added since the last piece."""
-        tracked.position, tracked.done = position, done
-        if not self._partial.keeps or not tracked.times:
-            return
-        new = slice(self._written, None)
-        self._partial.save(
-            f"{self._name}-{self._pieces:04d}",
-            start=np.array(self._written),
-            times=np.array(tracked.times[new]),
-            poses=np.array(tracked.poses[new]).reshape(-1, 4, 4),
-            weakest=np.array(tracked.weakest[new]).reshape(-1, 3),
-            sizes=np.array([len(points) for points in self._fresh], np.int64),
-            points=np.concatenate([np.empty((0, 3)), *self._fresh]),
-            place=position.as_array(),
-            done=np.array(done),
-        )
-        self._pieces, self._written, self._fresh = self._pieces + 1, len(tracked.times), []
-
-
 @dataclass(frozen=True)
 class Odometry:
     """Poses of the LiDAR in the middle of each sweep, in the frame of the first of them."""
@@ -233,32 +153,13 @@ class Odometry:
     weakest: Float[np.ndarray, "n 3"]  # Unit direction in each sweep that its walls say least about: the bore's axis
 
 
-def estimate_odometry(recording: Recording, guide: Guide | None, stage: Stage, log: OdometryLog) -> Odometry:
+def estimate_odometry(recording: Recording, guide: Guide | None, stage: Stage) -> Odometry:
     """Estimates one pose for each sweep of at least 100 returns; raises `FitError` for fewer than two.
 
     Without a guide, each sweep is expected to go on as the last did.
     """
-    tracked = log.read()
-    tracker = Tracker()
-    if tracked.times:
-        stage.resume(tracked.position.messages)
-    if not tracked.done:
-        for thinned, pose, middle in zip(tracked.thinned, tracked.poses, tracked.times, strict=True):
-            tracker.follow(thinned, pose, middle)
-        _track_scans(recording, guide, stage, log, tracker, tracked)
-    if len(tracked.times) < 2:
-        count = len(tracked.times)
-        raise FitError(f"{recording.path}: only {count} scans hold {MIN_POINTS} points; too few for odometry")
-    stack = np.asarray(tracked.poses)
-    poses = Trajectory(np.asarray(tracked.times), stack[:, :3, 3], Rotation.from_matrix(stack[:, :3, :3]), LIBRARY)
-    return Odometry(poses, np.asarray(tracked.weakest))
-
-
-def _track_scans(
-    recording: Recording, guide: Guide | None, stage: Stage, log: OdometryLog, tracker: Tracker, tracked: TrackedSweeps
-) -> None:
-    times = tracked.times
-    for scan in recording.scans(tracked.position):
+    tracker, times, weakest = Tracker(), list[float](), list[np.ndarray]()
+    for scan in recording.scans():
         stage.advance()
         span = float(scan.times.max(initial=0.0))
         middle = scan.stamp + 0.5 * span
@@ -268,8 +169,8 @@ def _track_scans(
             or (times and middle <= times[-1])  # a message that was recorded twice
         ):
             continue
-        weakest = tracker.register(scan, middle, guide)
-        log.add(tracked, middle, tracker.poses[-1], weakest, tracker.thinned)
-        if log.due():
-            log.write(tracked, recording.position)
-    log.write(tracked, recording.position, done=True)
+        weakest.append(tracker.register(scan, middle, guide))
+        times.append(middle)
+    if len(times) < 2:
+        raise FitError(f"{recording.path}: only {len(times)} scans hold {MIN_POINTS} points; too few for odometry")
+    return Odometry(tracker.trajectory(times, LIBRARY), np.asarray(weakest))

@@ -15,20 +15,20 @@ from scipy.spatial.transform import Rotation
 
 from scene.cloud import Cloud
 from scene.errors import RecordingError
+from scene.inputs import hash_inputs
 from scene.poses.calibration import Calibration, Mount
 from scene.poses.clocks import settle_inertial, settle_poses
 from scene.poses.consistency import check_poses, reorder
 from scene.poses.imu import Inertial, find_inertial, gyro_guide, level_rotation
-from scene.poses.odometry import LIBRARY, Guide, Odometry, OdometryLog, estimate_odometry
+from scene.poses.odometry import LIBRARY, Guide, Odometry, estimate_odometry
 from scene.poses.registration import register_scans
 from scene.poses.smoother import Noise, Problem, imu_steps, inertial_problem, odometry_problem, solve_with_heading
 from scene.poses.terms import Chain
 from scene.poses.trajectory import MIN_CONTROL_SHARE, Control, Trajectory, load_control, load_tum
 from scene.progress import Stages
 from scene.reading.cloudfile import read_cloud
-from scene.reading.formats import ReadingConfig, describe, own_readers
+from scene.reading.formats import ReadingConfig, describe
 from scene.reading.recording import Recording
-from scene.resume import Partial, hash_inputs, resume_key
 
 
 @dataclass(frozen=True)
@@ -43,12 +43,9 @@ class Located:
     most_uncovered: float = 0.05  # Share of the scans that may lie outside the trajectory's time
 
 
-def run_odometry(
-    recording: Recording, guide: Guide | None, progress: Stages, partial: Partial, turn: str = "first"
-) -> Odometry:
-    """Runs LiDAR odometry as a stage of a build, with its partial results."""
-    stage = progress.start(f"LiDAR odometry, {turn} pass", recording.scan_count)
-    return estimate_odometry(recording, guide, stage, OdometryLog(partial, f"odometry-{turn}"))
+def run_odometry(recording: Recording, guide: Guide | None, progress: Stages, turn: str = "first") -> Odometry:
+    """Runs LiDAR odometry as a stage of a build."""
+    return estimate_odometry(recording, guide, progress.start(f"LiDAR odometry, {turn} pass", recording.scan_count))
 
 
 def locate_given(trajectory: Trajectory) -> Located:
@@ -76,16 +73,14 @@ def _find_timed(
     return inertial, mount, clock.facts
 
 
-def locate_by_odometry(
-    recording: Recording, calibration: Calibration, progress: Stages, partial: Partial, auto: bool = False
-) -> Located:
+def locate_by_odometry(recording: Recording, calibration: Calibration, progress: Stages, auto: bool = False) -> Located:
     """Locates the LiDAR by odometry, helped by the gyro where there is an IMU; raises `FitError` for too few scans.
 
     With `auto` the clock of the IMU is set right.
     """
     inertial, mount, clock = _find_timed(recording, calibration, auto)
     guide = gyro_guide(inertial, mount) if inertial and mount else None
-    trajectory = run_odometry(recording, guide, progress, partial).trajectory
+    trajectory = run_odometry(recording, guide, progress).trajectory
     level = level_rotation(recording, trajectory, inertial, mount)
     poses = Trajectory(trajectory.times, level.apply(trajectory.positions), level * trajectory.rotations, LIBRARY)
     facts = {
@@ -111,7 +106,6 @@ def locate_by_control(
     control: Control,
     calibration: Calibration,
     progress: Stages,
-    partial: Partial,
     auto: bool = False,
 ) -> Located:
     """Locates the LiDAR in the control's frame from control, odometry and IMU, whose clock is set right with `auto`.
@@ -125,10 +119,10 @@ def locate_by_control(
     control.require_overlap(times[0], times[-1], recording.path)
     inertial, mount, clock = _find_timed(recording, calibration, auto)
     if inertial and mount:
-        problem, chain = _solve_with_imu(recording, inertial, mount, control, calibration, progress, partial)
+        problem, chain = _solve_with_imu(recording, inertial, mount, control, calibration, progress)
         trajectory = _lidar_poses(chain, mount)
     else:
-        problem, chain = _solve_without_imu(recording, control, calibration, progress, partial)
+        problem, chain = _solve_without_imu(recording, control, calibration, progress)
         trajectory = _lidar_poses(chain, Mount(np.eye(3), np.zeros(3)))
     return Located(
         trajectory,
@@ -152,27 +146,24 @@ def _solve_with_imu(
     control: Control,
     calibration: Calibration,
     progress: Stages,
-    partial: Partial,
 ) -> tuple[Problem, Chain]:
     lever = mount.rotation @ calibration.prism + mount.shift
     problem, chain = inertial_problem(inertial, control, lever, Noise())
-    guess = _load_or_solve(partial, "smoothed", lambda: solve_with_heading(problem, chain), progress)
-    odometry = run_odometry(recording, Guide(_lidar_poses(guess, mount), True, *_BY_CONTROL), progress, partial)
+    guess = _smooth(progress, lambda: solve_with_heading(problem, chain))
+    odometry = run_odometry(recording, Guide(_lidar_poses(guess, mount), True, *_BY_CONTROL), progress)
     whole = replace(problem, steps=imu_steps(odometry, guess, mount))
-    return whole, _load_or_solve(partial, "smoothed-again", lambda: whole.solve(guess)[0], progress)
+    return whole, _smooth(progress, lambda: whole.solve(guess)[0])
 
 
 def _solve_without_imu(
-    recording: Recording, control: Control, calibration: Calibration, progress: Stages, partial: Partial
+    recording: Recording, control: Control, calibration: Calibration, progress: Stages
 ) -> tuple[Problem, Chain]:
     """Smooths twice: the first result guides the second odometry, which then slips less."""
     guide = None
     for pass_name in ("first", "second"):
-        odometry = run_odometry(recording, guide, progress, partial, pass_name)
+        odometry = run_odometry(recording, guide, progress, pass_name)
         problem, guess = odometry_problem(odometry, control, calibration.prism, Noise())
-        chain = _load_or_solve(
-            partial, f"smoothed-{pass_name}", functools.partial(solve_with_heading, problem, guess), progress
-        )
+        chain = _smooth(progress, functools.partial(solve_with_heading, problem, guess))
         guide = Guide(_lidar_poses(chain, Mount(np.eye(3), np.zeros(3))), True, *_BY_CONTROL_WITHOUT_IMU)
     return problem, chain
 
@@ -202,17 +193,13 @@ def _lidar_poses(chain: Chain, mount: Mount) -> Trajectory:
     )
 
 
-def _load_or_solve(partial: Partial, name: str, solve: Callable[[], Chain], progress: Stages) -> Chain:
-    """Return a smoothed trajectory, from the partial results where an earlier build got so far."""
+def _smooth(progress: Stages, solve: Callable[[], Chain]) -> Chain:
+    """Return a smoothed trajectory, as a stage of a build."""
     stage = progress.start("smoothing the trajectory", 1)
-    known = partial.load(name)
-    chain = Chain(**known) if known else solve()
-    # One memory layout whether read back or not: the order of later sums may depend on it.
-    arrays = {field.name: np.ascontiguousarray(getattr(chain, field.name)) for field in fields(Chain)}
-    if not known:
-        partial.save(name, **arrays)
+    chain = solve()
     stage.advance()
-    return Chain(**arrays)
+    # One memory layout: the order of later sums may depend on it.
+    return Chain(**{field.name: np.ascontiguousarray(getattr(chain, field.name)) for field in fields(Chain)})
 
 
 @dataclass(frozen=True)
@@ -235,7 +222,6 @@ def place_recording(
     voxel: float,
     reading: ReadingConfig,
     progress: Stages,
-    partial: Partial,
     more: tuple[Path, ...] = (),
 ) -> Placed:
     """Finds the poses where they are not given, and places every return in a cloud thinned to `voxel`, m.
@@ -250,17 +236,15 @@ def place_recording(
     with Recording(path, reading.topic, reading.format, reading.times, more) as recording:
         print(f"detected: {describe(recording.peek())}", flush=True)
         record = hash_inputs([path, *more, *beside], progress)
-        way = type(given if given is not None else prism).__name__
-        partial.open(resume_key(record, voxel, reading, calibration, way, own_readers()))
         auto = reading.clock == "auto"
         if given is not None:
             located = _check_given(recording, given, reading)
         elif prism is not None:
-            located = _check(recording, locate_by_control(recording, prism, calibration, progress, partial, auto))
+            located = _check(recording, locate_by_control(recording, prism, calibration, progress, auto))
         else:
-            located = locate_by_odometry(recording, calibration, progress, partial, auto)
+            located = locate_by_odometry(recording, calibration, progress, auto)
         stage = progress.start("registering scans", recording.scan_count)
-        registered = register_scans(recording, located.trajectory, voxel, stage, located.most_uncovered, partial)
+        registered = register_scans(recording, located.trajectory, voxel, stage, located.most_uncovered)
         facts = {
             **recording.facts,
             "scans": recording.scan_count,
@@ -296,13 +280,12 @@ def _check(recording: Recording, located: Located) -> Located:
     return located if check is None else replace(located, facts={**located.facts, **check.facts})
 
 
-def place_cloud(path: Path, voxel: float, reading: ReadingConfig, progress: Stages, partial: Partial) -> Placed:
+def place_cloud(path: Path, voxel: float, reading: ReadingConfig, progress: Stages) -> Placed:
     """Reads and thins a cloud that is registered already; see `place_recording`.
 
     Raises `RecordingError` for a file that is damaged, empty, or of no usable unit.
     """
     record = hash_inputs([path], progress)
-    partial.open(resume_key(record, voxel, reading, own_readers()))
-    cloud, facts = read_cloud(path, voxel, reading, progress.start("reading points", None), partial)
+    cloud, facts = read_cloud(path, voxel, reading, progress.start("reading points", None))
     print(f"detected: {describe(facts)}", flush=True)
     return Placed(cloud, record, facts)

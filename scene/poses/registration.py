@@ -9,9 +9,8 @@ from scene.cloud import Cloud, VoxelMean
 from scene.errors import FitError, RecordingError
 from scene.poses.trajectory import Trajectory
 from scene.progress import Stage
-from scene.reading.recording import START, ReadPosition, Recording
+from scene.reading.recording import Recording
 from scene.reading.times import Scan
-from scene.resume import Partial
 
 _KNOTS = 21  # poses interpolated per sweep; between two of them, 5 ms, a walker's motion is straight
 _BATCH = 20  # sweeps thinned together
@@ -44,25 +43,15 @@ class Registered:
 
 
 def register_scans(
-    recording: Recording,
-    trajectory: Trajectory,
-    voxel: float,
-    stage: Stage,
-    most_uncovered: float = 0.05,
-    partial: Partial | None = None,
+    recording: Recording, trajectory: Trajectory, voxel: float, stage: Stage, most_uncovered: float = 0.05
 ) -> Registered:
     """Places every return in a cloud thinned to `voxel`, m, and keeps some of those below the LiDAR as they are.
 
     Scans that the trajectory does not cover are left out. Raises `RecordingError` where they are more than
     `most_uncovered`, a share, and `FitError` where no point is left.
     """
-    partial = partial or Partial(None)
-    state = _Registration(VoxelMean(voxel))
-    if (known := partial.load("cloud")) is not None:
-        state = _Registration.restored(known, voxel)
-        stage.resume(state.position.messages)
-    batch = []
-    for scan in recording.scans(state.position):
+    state, batch = _Registration(VoxelMean(voxel)), []
+    for scan in recording.scans():
         stage.advance()
         state.span = (min(state.span[0], scan.stamp), max(state.span[1], scan.end))
         if trajectory.covers(scan.stamp, scan.end):
@@ -73,15 +62,10 @@ def register_scans(
         if len(batch) == _BATCH:
             state.thinned.add(np.concatenate(batch))
             state.choose_every(recording.scan_count, trajectory)
-            batch, state.position = [], recording.position
-            if partial.due():
-                partial.save("cloud", **state.arrays())
+            batch = []
     if batch:
         state.thinned.add(np.concatenate(batch))
-    state.position = recording.position
     _require_covered(state, recording, trajectory, most_uncovered)
-    if partial.due():
-        partial.save("cloud", **state.arrays())
     cloud = state.thinned.cloud()
     if not len(cloud.points):
         raise FitError(f"{recording.path}: no return is left after registration")
@@ -100,7 +84,6 @@ class _Registration:
     """State of a registration between two batches."""
 
     thinned: VoxelMean
-    position: ReadPosition = START
     uncovered: int = 0
     span: tuple[float, float] = (np.inf, -np.inf)
     low: list[np.ndarray] = field(default_factory=list)
@@ -125,22 +108,6 @@ class _Registration:
         seconds = np.arange(trajectory.times[0], trajectory.times[-1], 1.0)
         way = float(np.linalg.norm(np.diff(trajectory.at(seconds)[0], axis=0), axis=1).sum())
         self.every = max(int(self.thinned.returns / _BATCH * scans / max(way, 1.0) / _A_METRE), 1)
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """Return the state as arrays, for a partial result."""
-        counts = {"place": self.position.as_array(), "span": np.array(self.span),
-                  "scans": np.array([self.uncovered, self.placed, self.every])}  # fmt: skip
-        return {**counts, "low": np.concatenate([np.empty((0, 3)), *self.low]), **self.thinned.arrays()}
-
-    @classmethod
-    def restored(cls, arrays: dict[str, np.ndarray], voxel: float) -> "_Registration":
-        """Return the state that `arrays` returned as arrays."""
-        start, end = arrays["span"]
-        uncovered, placed, every = (int(count) for count in arrays["scans"])
-        return cls(
-            VoxelMean.restored(voxel, arrays), ReadPosition.from_array(arrays["place"]), uncovered,
-            (float(start), float(end)), [arrays["low"]], placed, every,
-        )  # fmt: skip
 
 
 def _require_covered(state: _Registration, recording: Recording, trajectory: Trajectory, most_uncovered: float) -> None:

@@ -1,6 +1,5 @@
 """Registered clouds from files of any format, in metres, z up: read in chunks and thinned on the way."""
 
-import itertools
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,6 @@ from scene.progress import Stage
 from scene.reading.formats import Format, ReadingConfig, detect
 from scene.reading.source import CloudSource, Frame, choose_frame, needs_local_points, refuse_damage
 from scene.reading.tables import told_columns
-from scene.resume import Partial
 
 _TABLES = ("table", "parquet")
 _COARSE, _HOPELESS = 0.02, 0.25  # m: coordinates rounded so far are told, and refused
@@ -26,7 +24,6 @@ def read_cloud(
     voxel: float,
     config: ReadingConfig | None = None,
     stage: Stage | None = None,
-    partial: Partial | None = None,
 ) -> tuple[Cloud, dict[str, Any]]:
     """Reads a registered cloud, thinned to `voxel`, m; returns it and what was detected.
 
@@ -40,7 +37,7 @@ def read_cloud(
     with refuse_damage(path, f"a readable {detected.format.label} cloud", RecordingError):
         source: CloudSource = _open_cloud(path, detected.format, config)
         frame = _frame_of(path, source, config)
-        thinned, read, rounding = _thin(source, frame, voxel, stage, partial or Partial(None))
+        thinned, read, rounding = _thin(source, frame, voxel, stage)
     _refuse_unusable(path, thinned, read, rounding, frame.unit)
     rounded: dict[str, Any] = {"rounded_to": rounding} if rounding >= _COARSE else {}
     facts: dict[str, Any] = {
@@ -67,31 +64,21 @@ def _frame_of(path: Path, source: CloudSource, config: ReadingConfig) -> Frame:
         raise RecordingError(f"{path}: {error}") from error
 
 
-def _thin(
-    source: CloudSource, frame: Frame, voxel: float, stage: Stage | None, partial: Partial
-) -> tuple[VoxelMean, int, float]:
-    """Thins a cloud chunk by chunk, from where an earlier build stopped.
+def _thin(source: CloudSource, frame: Frame, voxel: float, stage: Stage | None) -> tuple[VoxelMean, int, float]:
+    """Thins a cloud chunk by chunk.
 
     Returns:
-        The thinned cloud, the number of points read, and the coarsest rounding of the first chunk's coordinates, m; 0
-        where none was read now.
+        The thinned cloud, the number of points read, and the coarsest rounding of the first chunk's coordinates, m.
     """
-    thinned, read, skip, rounding = VoxelMean(voxel), 0, 0, None
-    if (known := partial.load("cloud")) is not None:
-        thinned, (read, skip) = VoxelMean.restored(voxel, known), (int(n) for n in known["read"])
+    thinned, read, rounding = VoxelMean(voxel), 0, None
     if stage is not None:
         stage.expect(source.count)
-        if skip:
-            stage.resume(read)
-    # Chunks that an earlier build had thinned are decoded again, which most formats cannot do without.
-    for index, chunk in enumerate(itertools.islice(source.chunks(), skip, None), skip + 1):
+    for chunk in source.chunks():
         read += len(chunk)
         thinned.add(placed := frame.apply(chunk))
         rounding = max(measure_rounding(placed)) if rounding is None else rounding
         if stage is not None:
             stage.advance(len(chunk))
-        if partial.due():
-            partial.save("cloud", read=np.array([read, index]), **thinned.arrays())
     return thinned, read, rounding or 0.0
 
 

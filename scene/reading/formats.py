@@ -16,7 +16,6 @@ from scene.reading.rosbag import RosBag
 from scene.reading.scans import open_folder, scan_files
 from scene.reading.tables import open_parquet, open_ptx, open_table
 from scene.reading.times import TimeConfig
-from subterra_jax.host.loading import source_digest
 
 Kind = Literal["recording", "cloud", "rings"]
 _SHOWN_FACTS = ("format", "topic", "message_type", "times", "point_times", "unit", "axes", "crs")
@@ -117,11 +116,6 @@ def register_reader(
     if kind not in ("recording", "cloud"):
         raise ValueError(f"kind must be recording or cloud, got {kind!r}")
     _own[name] = Format(name, label or name, kind, open, suffixes, magic)
-
-
-def own_readers() -> list[str]:
-    """Return names and source hashes of the rows that users added; partial results depend on them."""
-    return [f"{name} {source_digest(row.open) or row.open!r}" for name, row in sorted(_own.items())]
 
 
 def detect(path: Path, name: str | None = None) -> Detected:

@@ -1,7 +1,7 @@
 """Any recording as a stream of timed scans."""
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
@@ -20,28 +20,6 @@ _MOST_OUT_OF_ORDER = 0.05
 _LONGEST_PAUSE = 3600.0  # s; a stamp further from the last one is damage, and would make all later ones look late
 
 
-@dataclass(frozen=True)
-class ReadPosition:
-    """A position in a recording, up to which it has been read."""
-
-    messages: int = 0  # Number of LiDAR messages read
-    last: float | None = None  # Time of the last scan yielded, s; `None` before the first
-    late: int = 0  # Number of messages left out because their time did not grow
-
-    def as_array(self) -> Float[np.ndarray, "3"]:
-        """Return the three attributes as numbers."""
-        return np.array([self.messages, np.nan if self.last is None else self.last, self.late])
-
-    @classmethod
-    def from_array(cls, values: Float[np.ndarray, "3"]) -> "ReadPosition":
-        """Return the position of which `as_array` made `values`."""
-        last = float(values[1])
-        return cls(int(values[0]), None if np.isnan(last) else last, int(values[2]))
-
-
-START = ReadPosition()
-
-
 class Recording:
     """An open recording. A context manager; iterate `scans()` as often as needed.
 
@@ -50,7 +28,6 @@ class Recording:
         topic: The LiDAR topic read; the folder's name for a folder of scans.
         scan_count: Scans in the recording.
         facts: Detected facts, for the manifest; `point_times` and the counts of what is left out follow on reading.
-        position: Position up to which the latest `scans()` has read.
 
     Raises:
         RecordingError: Not a recording, truncated, or without a LiDAR topic.
@@ -76,7 +53,6 @@ class Recording:
             beside = (tuple(part.path for part in parts),) if parts else ()
             self._source: ScanSource = detected.format.open(detected.path, topic, *beside)
         self._source.facts["format_by"] = detected.by
-        self.position = START
         self.topic, self.scan_count, self.facts = self._source.topic, self._source.scan_count, self._source.facts
 
     @property
@@ -127,19 +103,16 @@ class Recording:
         self.__dict__["convention"] = found
         self.facts["point_times"] = found.words
 
-    def scans(self, after: ReadPosition = START) -> Iterator[Scan]:
-        """Yields the scans in the order of the recording, from the position `after` on.
+    def scans(self) -> Iterator[Scan]:
+        """Yields the scans in the order of the recording.
 
         A scan whose time does not grow is left out and counted in `facts`, and so is a point whose time is none of its
         sweep. Raises `RecordingError`, which says which message is damaged, or where more than 5 % of either are left
         out.
         """
-        self.position, last, late = after, after.last, after.late
-        if late:
-            self.facts["scans_out_of_order"] = late
-        convention = self.convention
+        convention, last, late = self.convention, None, 0
         self._points = self._bad = 0
-        for index, raw in enumerate(self._source.scans(after.messages), after.messages):
+        for index, raw in enumerate(self._source.scans()):
             scan = self._timed(convention, raw)
             if last is not None and scan.stamp <= last:
                 late += 1
@@ -156,7 +129,6 @@ class Recording:
                     f"{scan.stamp - last:.0f} s after the one before it"
                 )
             last = scan.stamp
-            self.position = ReadPosition(index + 1, last, late)
             yield scan
         if self._bad > MOST_BAD * self._points:
             raise RecordingError(

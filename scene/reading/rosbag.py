@@ -121,10 +121,10 @@ class RosBag(ScanSource):
             return self._store.deserialize_ros1(raw, message_type)
         return self._store.deserialize_cdr(raw, message_type)
 
-    def scans(self, skip: int = 0, only: frozenset[int] | None = None) -> Iterator[RawScan]:
+    def scans(self, only: frozenset[int] | None = None) -> Iterator[RawScan]:
         """Yields the scans in the order of the bag; a header without a stamp takes the time of its message.
 
-        The first `skip` messages are not parsed, nor any but `only` some. Raises `RecordingError`, which says which
+        Of `only` some the others are not parsed. Raises `RecordingError`, which says which
         message is damaged.
         """
         index, last = 0, self.scan_count if only is None else max(only, default=-1)
@@ -138,7 +138,7 @@ class RosBag(ScanSource):
                 raise RecordingError(
                     f"{self.path}: damaged after scan {index} of {self.topic} ({cause(error)})"
                 ) from error
-            if index < skip or (only is not None and index not in only):
+            if only is not None and index not in only:
                 index += 1
                 continue
             try:

@@ -64,9 +64,9 @@ class ScanSource:
         self.path, self.topic, self.scan_count, self.facts = path, path.name, scan_count, facts
         self._read, self._close = read, close
 
-    def scans(self, skip: int = 0, only: frozenset[int] | None = None) -> Iterator[RawScan]:
-        """Yields the scans from number `skip` on, or `only` some; `RecordingError` says which is damaged."""
-        for index in range(skip, self.scan_count) if only is None else sorted(only):
+    def scans(self, only: frozenset[int] | None = None) -> Iterator[RawScan]:
+        """Yields all scans, or `only` those of some numbers; `RecordingError` says which is damaged."""
+        for index in range(self.scan_count) if only is None else sorted(only):
             try:
                 raw = self._read(index)
             except RecordingError:

@@ -124,7 +124,7 @@ class Convention:
         begin = stamp - (self.length if self.reference == "end" else 0.0)
         if self.kind == "after":
             shift = min(low, 0.0)
-            return (begin if self.reference == "end" else stamp + shift), times - shift
+            return (stamp + shift if self.reference is None else begin), times - shift
         times = times - low
         if self.kind == "same clock":
             return low, times

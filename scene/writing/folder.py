@@ -18,10 +18,10 @@ from scene.config import BuildConfig
 from scene.errors import FitError
 from scene.fitting.lining import MEASURED, count_alone
 from scene.fitting.trackseen import SeenTrack
+from scene.inputs import library_versions
 from scene.judging.judge import STATION, Judgement
 from scene.judging.page import render_page
 from scene.poses.trajectory import Trajectory, save_tum
-from scene.resume import library_versions
 from scene.writing.furnished import count_pieces, furnish_bore, planar_segments
 from scene.writing.mesh import as_trimesh, build_solid, open_lining
 from scene.writing.mjcf import SceneConfig, write_scene

@@ -3,7 +3,6 @@
 import hashlib
 import importlib
 import importlib.util
-import inspect
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -75,12 +74,3 @@ def file_digest(path: Path) -> str:
         return hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError as error:
         raise UserCodeError(f"{path}: cannot be read ({error.strerror})") from error
-
-
-def source_digest(loaded: Any) -> str:
-    """Returns the SHA-256 of the file that defines a class or a function; empty where it has none."""
-    try:
-        source = inspect.getsourcefile(loaded)
-    except TypeError:  # built into Python
-        return ""
-    return file_digest(Path(source)) if source else ""
