@@ -6,7 +6,6 @@ bore, `fitting` of axis, wall, lining and track, `judging` of the bore against a
 
 import sys
 import time
-import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -15,7 +14,6 @@ from pathlib import Path
 from typing import Annotated
 
 import mujoco
-import numpy as np
 import tyro
 
 from scene.cleaning.clean import clean_cloud
@@ -27,7 +25,8 @@ from scene.fitting.lining import add_lining
 from scene.fitting.rings import fit_ring_survey
 from scene.fitting.trackseen import find_track, measure_gauge
 from scene.inputs import hash_inputs
-from scene.judging.judge import Judgement, JudgingConfig, judge_bore, require_trust
+from scene.judging.codes import Code
+from scene.judging.judge import Judgement, JudgingConfig, Warned, judge_bore, require_trust
 from scene.judging.page import render_page
 from scene.judging.returns import track_zone
 from scene.judging.sanity import doubt_bore, doubt_layers, doubt_track
@@ -218,8 +217,20 @@ def judge(result: Reconstruction, track: Track, config: JudgingConfig) -> Judgem
         spacing = float(result.facts.get("profile_spacing") or 0.0)
         zone = track_zone(track, result.bore)
         judgement = judge_bore(result.bore, result.everything, config, zone, result.cause, result.removed, spacing)
-    found = sorted([*odd, *judgement.warnings], key=lambda warning: not warning.refuses)
+    doubt = result.facts.get("clock_doubt") or result.facts.get("pose_doubt")
+    seen = _blame_poses(judgement.warnings) if doubt else judgement.warnings
+    found = sorted([*odd, *seen], key=lambda warning: not warning.refuses)
     return replace(judgement, warnings=tuple(found))
+
+
+def _blame_poses(warnings: tuple[Warned, ...]) -> list[Warned]:
+    """Return warnings that name nothing in the bore: where clocks or poses are at fault, they scatter the returns."""
+    share = "; the poses, or their clock, scatter them"
+    return [
+        replace(one, text=one.text.partition(", most ")[0] + share) if one.code is Code.UNEXPLAINED else one
+        for one in warnings
+        if one.code is not Code.PLACE
+    ]
 
 
 def _require_trust(name: str, result: Reconstruction, judgement: Judgement, force: bool) -> None:
@@ -288,16 +299,13 @@ def command(
 
 def main() -> int:
     """Runs the command and returns its exit status."""
-    np.seterr(all="ignore")
     wanted = parse(lambda words: tyro.cli(command, prog="python -m scene.build", args=words))
 
     def act() -> None:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of libraries: what a user must know of is said by this program
-            try:
-                wanted()
-            except FitError as error:
-                raise error.about(f"{error} [{error.code}]" if error.code else str(error)) from error
+        try:
+            wanted()
+        except FitError as error:
+            raise error.about(f"{error} [{error.code}]" if error.code else str(error)) from error
 
     return run_command(act, "interrupted; the output is as it was")
 

@@ -8,6 +8,7 @@ Each section is laid on the template of the last few metres by what fits it. A n
 nothing and so moves nothing; a section that changes over several metres becomes the template.
 """
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -199,7 +200,9 @@ class Course:
     @property
     def usual(self) -> Float[np.ndarray, " rays"]:
         """Distance of the wall from the middle in each direction, in the median along the bore, m."""
-        return _filled(np.nanmedian(self.radius, axis=0))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a direction that nobody saw
+            return _filled(np.nanmedian(self.radius, axis=0))
 
     @property
     def width(self) -> float:

@@ -27,7 +27,7 @@ from scene.poses.terms import Chain
 from scene.poses.trajectory import MIN_CONTROL_SHARE, Control, Trajectory, load_control, load_tum
 from scene.progress import Stages
 from scene.reading.cloudfile import read_cloud
-from scene.reading.formats import ReadingConfig, describe
+from scene.reading.formats import ReadingConfig, describe, left_out
 from scene.reading.recording import Recording
 
 
@@ -251,6 +251,8 @@ def place_recording(
             "scans_without_pose": registered.uncovered,
             **located.facts,
         }
+        if dropped := left_out(facts):
+            print(f"left out: {dropped}", flush=True)
     return Placed(registered.cloud, record, facts, located, registered.low)
 
 

@@ -138,10 +138,26 @@ def detect(path: Path, name: str | None = None) -> Detected:
     return detected
 
 
+_LEFT_OUT = {
+    "points_without_time": "points without a time of their sweep",
+    "scans_out_of_order": "scans out of order",
+    "scans_without_pose": "scans without a pose",
+}
+
+
+def left_out(facts: dict[str, Any]) -> str:
+    """Return what of an input was left out, and why, for people; empty where nothing was."""
+    known = [f"{facts[key]:,} {words}" for key, words in _LEFT_OUT.items() if facts.get(key)]
+    clouds = facts.get("points_left_out", {}).items()
+    return ", ".join([*known, *(f"{count:,} points ({why.replace('_', ' ')})" for why, count in clouds)])
+
+
 def describe(facts: dict[str, Any]) -> str:
     """Return what was detected of a recording, a cloud or a survey, in one line for people."""
     parts = [f"{facts['kind']}"]
     parts += [f"{key.replace('_', ' ')} {facts[key]}" for key in _SHOWN_FACTS if key in facts]
+    if dropped := left_out(facts):
+        parts.append(f"left out: {dropped}")
     if others := facts.get("other_lidar_topics"):
         parts.append(f"not read: {' '.join(others)} (--topic chooses)")
     return "; ".join(parts)

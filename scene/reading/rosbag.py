@@ -168,6 +168,9 @@ class RosBag(ScanSource):
             missing = f"LiDAR topic {topic}" if topic else "LiDAR topic (livox CustomMsg or sensor_msgs/PointCloud2)"
             raise RecordingError(f"{self.path}: has no {missing}; it holds {one_line(held)}")
         best = max(chosen, key=_likelihood)
+        alike = sorted({c.topic for c in chosen if _likelihood(c)[:3] == _likelihood(best)[:3]})
+        if len(alike) > 1:
+            raise RecordingError(f"{self.path}: holds {len(alike)} LiDARs, {', '.join(alike)}; --topic says which")
         same = [c for c in chosen if (c.topic, c.msgtype) == (best.topic, best.msgtype)]
         return same, sorted({c.topic for c in lidars} - {best.topic})
 

@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import json
+import xml.etree.ElementTree as ET
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -62,12 +63,16 @@ def write_folder(
     """Writes all parts of a scene folder and compiles both scenes; raises `FitError` where no scene can be made."""
     count, furnished = write_geometry(folder, name, config.provenance, result.bore, track, config.scene)
     content = _describe_scene(name, result, track, config.provenance, count, furnished)
+    if crs := result.facts.get("crs"):
+        state_crs(folder, str(crs))
     content |= {"judgement": judgement.facts, "removed": [part.facts for part in result.removed]}
     write_stations(folder / "stations.csv", judgement)
     (folder / "build.html").write_text(render_page(name, result.bore, judgement, content), encoding="utf-8")
     write_manifest(folder / "manifest.json", content, config)
     if result.cloud is not None:
-        trimesh.PointCloud(thin_cloud(result.cloud, _PREVIEW_VOXEL)).export(folder / "cloud.ply")
+        preview = trimesh.PointCloud(thin_cloud(result.cloud, _PREVIEW_VOXEL)).export(file_type="ply")
+        note = f"\ncomment crs {crs}".encode("ascii", "replace") if crs else b""
+        (folder / "cloud.ply").write_bytes(preview.replace(b" 1.0", b" 1.0" + note, 1))
     if result.odometry is not None:
         save_tum(result.odometry, folder / "odometry.tum")
     for scene in SCENES:
@@ -75,6 +80,14 @@ def write_folder(
             mujoco.MjModel.from_xml_path(str(folder / scene))
         except ValueError as error:
             raise FitError(f"{scene}: MuJoCo refuses the scene ({error})") from error
+
+
+def state_crs(folder: Path, crs: str) -> None:
+    """Writes the coordinate reference system of an input into both scenes, as the MJCF text `crs`."""
+    text = ET.tostring(ET.Element("text", name="crs", data=crs), encoding="unicode")
+    for scene in SCENES:
+        content = (folder / scene).read_text()
+        (folder / scene).write_text(content.replace("</mujoco>", f"  <custom>{text}</custom>\n</mujoco>"))
 
 
 def write_geometry(

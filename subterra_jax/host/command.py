@@ -10,6 +10,7 @@ import re
 import shutil
 import sys
 import textwrap
+import warnings
 from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from typing import TypeVar
@@ -59,6 +60,9 @@ def run_command(
 ) -> int:
     """Runs a command and returns its exit status.
 
+    Warnings of libraries are not shown, unless Python is asked for them (`-W`, `PYTHONWARNINGS`): what a user must know
+    the command says itself.
+
     Args:
         act: The command; it returns its status, or `None` for 0.
         interrupted: Message after Ctrl-C.
@@ -69,7 +73,10 @@ def run_command(
         error, or 2; 130 after Ctrl-C.
     """
     try:
-        return act() or 0
+        with warnings.catch_warnings():
+            if not sys.warnoptions:
+                warnings.simplefilter("ignore")
+            return act() or 0
     except mistakes as error:
         print(f"error: {error_sentence(error)}", file=sys.stderr)
         return getattr(error, "exit_status", EXIT_BAD_INPUT)

@@ -32,9 +32,11 @@ def gyro(late: float, mount: Rotation) -> Inertial:
 def lidar() -> LidarTurns:
     middle = np.arange(8.0, 18.0, 0.1)
     turns = attitude(middle)
-    rate = (turns[:-1].inv() * turns[1:]).magnitude() / 0.1
-    noise = np.random.default_rng(0).normal(0, 0.02, len(rate))
-    return LidarTurns(middle[:-1], middle[1:], rate + noise)
+    rate = (turns[:-1].inv() * turns[1:]).as_rotvec() / 0.1 + np.random.default_rng(0).normal(
+        0, 0.02, (len(turns) - 1, 3)
+    )
+    rate[50] = [0.0, 0.0, 40.0]  # matched wrongly
+    return LidarTurns(middle[:-1], middle[1:], rate)
 
 
 @pytest.mark.parametrize("late", [0.0, 0.02, 0.1, -0.1, 0.7, -1.2])
@@ -48,7 +50,7 @@ def test_a_lag_is_found_whatever_the_mount(lidar, late):
 def test_turns_of_another_drive_and_none_at_all_tell_nothing(lidar):
     other = Trajectory(AT, np.zeros((len(AT), 3)), attitude(0.61 * AT + 500.0), "poses")
     assert find_lag(lidar, turns_of_poses(other)) is None
-    even = LidarTurns(lidar.start, lidar.end, np.full(len(lidar.start), 0.2))
+    even = LidarTurns(lidar.start, lidar.end, np.full_like(lidar.rate, 0.2))
     assert find_lag(even, turns_of_gyro(gyro(0.1, Rotation.identity()))) is None
 
 
@@ -96,13 +98,13 @@ def test_headers_at_the_end_of_their_sweeps_are_told_by_the_turns_where_nothing_
 
     class Late(Beside):
         late = 0.1
-        convention = Convention("after", "", span=0.1, guessed=guessed)
+        convention = Convention("after", "", length=0.1, guessed=guessed)
 
         def __init__(self) -> None:
             self.facts = {"point_times": "as it was"}
 
         def take_end(self) -> None:
-            self.late, self.convention = 0.0, Convention("after", "", span=0.1)
+            self.late, self.convention = 0.0, Convention("after", "", length=0.1)
 
     def shifted(recording):
         return LidarTurns(lidar.start + recording.late, lidar.end + recording.late, lidar.rate)

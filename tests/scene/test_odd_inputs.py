@@ -9,10 +9,11 @@ from laspy.vlrs.known import WktCoordinateSystemVlr
 
 from scene.errors import RecordingError
 from scene.reading.cloudfile import read_cloud
-from scene.reading.formats import ReadingConfig, detect
+from scene.reading.formats import ReadingConfig, describe, detect, left_out
 from scene.reading.recording import Recording
 from tests.scene.bags import write_bag
 from tests.scene.conventions import sweeps, write_convention
+from tests.scene.messages import PLAIN, pointcloud2, write_bag1
 
 XYZ = np.random.default_rng(0).uniform(1, 9, (500, 3))
 WKT = 'PROJCS["ETRS89 / UTM zone 33N",GEOGCS["ETRS89",UNIT["degree",0.0174]],UNIT["metre",1],AUTHORITY["EPSG","25833"]]'
@@ -148,3 +149,32 @@ def test_a_packed_recording_says_how_it_is_unpacked(tmp_path, name):
     tool = "gzip" if name.endswith("gz") else "zstd"
     with pytest.raises(RecordingError, match=rf"is compressed; decompress it first: {tool} -d {name}"):
         detect(path)
+
+
+def test_a_bag_whose_index_was_never_written_says_so(tmp_path):
+    raw = bytearray(write_convention(tmp_path / "a.bag").read_bytes())
+    place = raw.index(b"index_pos=") + len(b"index_pos=")
+    raw[place : place + 8] = bytes(8)
+    (tmp_path / "b.bag").write_bytes(raw)
+    with pytest.raises(RecordingError, match=r"b\.bag: not a whole ROS1 bag.*reindex before reading"):
+        Recording(tmp_path / "b.bag")
+
+
+def test_two_lidars_in_one_bag_are_asked_for(tmp_path):
+    rows = [
+        (start, pointcloud2(start, PLAIN, 12, dict(zip("xyz", points.T, strict=True))))
+        for start, points, _ in sweeps(3)
+    ]
+    bag = write_bag1(tmp_path / "a.bag", {"/lidar_front/points": rows, "/lidar_rear/points": rows, "/map": rows})
+    with pytest.raises(
+        RecordingError, match=r"a\.bag: holds 2 LiDARs, /lidar_front/points, /lidar_rear/points; --topic"
+    ):
+        Recording(bag)
+    with Recording(bag, topic="/lidar_rear/points") as recording:
+        assert recording.topic == "/lidar_rear/points"
+
+
+def test_what_was_left_out_is_said(tmp_path):
+    las = write_las(tmp_path / "a.las", XYZ, withheld=range(30), noise=(40, 41))
+    assert "left out: 30 points (withheld), 2 points (noise)" in describe({"kind": "cloud", **read_cloud(las, 0.01)[1]})
+    assert left_out({"points_without_time": 5, "scans_without_pose": 0}) == "5 points without a time of their sweep"

@@ -9,8 +9,6 @@ from scene.reading.times import Scan, TimeConfig
 from tests.scene.conventions import sweeps, write_convention
 from tests.scene.messages import pointcloud2, write_bag1
 
-BOOTS = {"320 s": 320.0, "1500 s": 1500.0, "30000 s": 3e4, "5 s": 5.0}
-
 
 def read(path, **told) -> tuple[list[Scan], dict]:
     with Recording(path, times=TimeConfig(**told)) as recording:
@@ -29,21 +27,29 @@ def agree(scans: list[Scan], late: float = 0.0) -> None:
 
 CONVENTIONS = {
     "s after the start": ({}, "`timestamp`, s after the stamp (its start)"),
-    "float ms": ({"unit": "ms"}, "`timestamp`, ms after the stamp"),
-    "float µs": ({"unit": "us"}, "`timestamp`, µs after the stamp"),
-    "whole µs": ({"unit": "us", "kind": "u4"}, "`timestamp`, µs after the stamp"),
-    "whole ns": ({"unit": "ns", "kind": "u4"}, "`timestamp`, ns after the stamp"),
-    "s before the end": ({"reference": "end"}, "`timestamp`, s before the stamp (its end)"),
-    "ms before the end": ({"reference": "end", "unit": "ms", "kind": "f4"}, "`timestamp`, ms before the stamp"),
-    "epoch s": ({"reference": "epoch"}, "`timestamp`, absolute, s"),
-    "epoch ns": ({"reference": "epoch", "unit": "ns"}, "`timestamp`, absolute, ns"),
-    "epoch µs": ({"reference": "epoch", "unit": "us"}, "`timestamp`, absolute, µs"),
-    **{f"s since boot, {name}": ({"reference": "boot", "boot": at}, "by another clock, s")
-       for name, at in BOOTS.items()},
-    **{f"float ns since boot, {name}": ({"reference": "boot", "boot": at, "unit": "ns"}, "by another clock, ns")
-       for name, at in BOOTS.items()},
-    "ns since boot in 32 bits, wrapped": (
-        {"reference": "boot", "boot": 320.0, "unit": "ns", "kind": "u4", "wrap": True}, "by another clock, ns"),
+    "float ms": ({"point_unit": "ms"}, "`timestamp`, ms after the stamp"),
+    "float µs": ({"point_unit": "us"}, "`timestamp`, µs after the stamp"),
+    "whole µs": ({"point_unit": "us", "point_type": "u4"}, "`timestamp`, µs after the stamp"),
+    "whole ns": ({"point_unit": "ns", "point_type": "u4"}, "`timestamp`, ns after the stamp"),
+    "s before the end": ({"header_of": "end"}, "`timestamp`, s before the stamp (its end)"),
+    "ms before the end": ({"header_of": "end", "point_unit": "ms", "point_type": "f4"}, "ms before the stamp"),
+    "epoch s": ({"point_times": "epoch"}, "`timestamp`, absolute, s"),
+    "epoch ns": ({"point_times": "epoch", "point_unit": "ns"}, "`timestamp`, absolute, ns"),
+    "epoch µs": ({"point_times": "epoch", "point_unit": "us"}, "`timestamp`, absolute, µs"),
+    **{f"{unit} since boot, {at:g} s": (
+        {"point_times": "boot", "boot": at, "point_unit": unit}, f"by another clock, {unit}")
+       for unit in ("s", "ns") for at in (5.0, 320.0, 1500.0, 3e4)},
+    **{f"{times} in 32 bits": (
+        {"point_times": times, "boot": 320.0, "point_unit": "ns", "point_type": "u4"}, "by another clock, ns")
+       for times in ("boot", "epoch")},
+    "a counter that wraps between two sweeps": (
+        {"point_times": "boot", "boot": 4.294967296 * 7 - 1.15, "point_unit": "ns", "point_type": "u4"},
+        "by another clock, ns"),
+    "ring by ring, highest byte first": ({"by_ring": True, "big_endian": True}, "s after the stamp"),
+    "ROS 2": ({"container": "mcap"}, "s after the stamp"),
+    "a split SQLite of ROS 2": ({"container": "db3", "bags": 3}, "s after the stamp"),
+    "a split MCAP of ROS 2": ({"container": "mcap", "bags": 2}, "s after the stamp"),
+    "a folder of bags": ({"bags": 3}, "s after the stamp"),
 }  # fmt: skip
 
 
@@ -59,20 +65,31 @@ def test_a_convention_is_decided_once_and_said(tmp_path, name):
 
 @pytest.mark.parametrize(("kind", "unit"), [("u4", "ns"), ("f8", "s"), ("f8", "us")])
 def test_a_few_bad_times_are_left_out_and_counted(tmp_path, kind, unit):
-    scans, facts = read(write_convention(tmp_path / "a.bag", kind=kind, unit=unit, bad=0.01))
+    scans, facts = read(write_convention(tmp_path / "a.bag", point_type=kind, point_unit=unit, bad_times=0.01))
     agree(scans)
     missing = sum(len(points) for _, points, _ in sweeps(12)) - sum(len(scan.points) for scan in scans)
     assert facts["points_without_time"] == missing > 0
 
 
+def test_a_few_times_that_are_no_number_are_left_out_and_counted(tmp_path):
+    rows = sweeps(12)
+    fields = [("x", "f4", 0), ("y", "f4", 4), ("z", "f4", 8), ("time", "f4", 12)]
+    times = np.where(np.arange(len(rows[0][2])) % 50 == 7, np.nan, rows[0][2])
+    raw = [(start, pointcloud2(start, fields, 16, {**dict(zip("xyz", points.T, strict=True)), "time": times}))
+           for start, points, _ in rows]  # fmt: skip
+    scans, facts = read(write_bag1(tmp_path / "a.bag", {"/points": raw}))
+    agree(scans)
+    assert facts["points_without_time"] == 12 * 8
+
+
 def test_many_bad_times_are_refused_with_their_share(tmp_path):
-    bag = write_convention(tmp_path / "a.bag", bad=0.07, count=40)
+    bag = write_convention(tmp_path / "a.bag", bad_times=0.07, count=40)
     with pytest.raises(RecordingError, match=r"a\.bag: [678]% of the points of /points"):
         read(bag)
 
 
 def test_one_value_a_sweep_says_nothing_and_the_headers_rule(tmp_path):
-    scans, facts = read(write_convention(tmp_path / "a.bag", reference="constant"))
+    scans, facts = read(write_convention(tmp_path / "a.bag", point_times="constant"))
     assert facts["point_times"] == "`timestamp` is one value in each sweep: every sweep is taken as static"
     assert [scan.stamp for scan in scans] == pytest.approx([start for start, _, _ in sweeps(12)])
     assert not any(scan.times.any() for scan in scans)
@@ -80,7 +97,7 @@ def test_one_value_a_sweep_says_nothing_and_the_headers_rule(tmp_path):
 
 @pytest.mark.parametrize("unit", ["s", "ms", "us", "ns"])
 def test_what_the_user_says_of_the_unit_is_never_detected_away(tmp_path, unit):
-    scans, facts = read(write_convention(tmp_path / "a.bag", unit="ms"), time_unit=unit)
+    scans, facts = read(write_convention(tmp_path / "a.bag", point_unit="ms"), time_unit=unit)
     assert "(by flag)" in facts["point_times"]
     scale = {"s": 1e3, "ms": 1.0, "us": 1e-3, "ns": 1e-6}[unit]
     assert scans[3].times.max() == pytest.approx(0.098 * scale)
@@ -90,7 +107,7 @@ def test_what_the_user_says_of_the_stamp_moves_the_sweeps(tmp_path):
     after = write_convention(tmp_path / "a.bag")
     agree(read(after, time_stamp="start")[0])
     agree(read(after, time_stamp="end")[0], late=-0.098)
-    boot = write_convention(tmp_path / "b.bag", reference="boot", boot=320.0)
+    boot = write_convention(tmp_path / "b.bag", point_times="boot", boot=320.0)
     agree(read(boot, time_stamp="end")[0], late=-0.098)
     scans, _ = read(boot, time_unit="none")
     assert not any(scan.times.any() for scan in scans)
