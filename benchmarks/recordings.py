@@ -16,7 +16,7 @@ import numpy as np
 import yaml
 from jaxtyping import Float
 
-from benchmarks.command import run_main
+from benchmarks.command import BenchmarkError, run_main
 from benchmarks.records import Record, measured, write_records
 from benchmarks.results import markdown_table
 from scene.build import reconstruct
@@ -43,7 +43,7 @@ _EVERY = 6  # firings of the VLP-16 of which one is kept
 _COMPARED = 12  # sweeps of a recording that are compared point by point
 _LATE, _CLOCK = 0.005, 0.010  # s: errors of a point's time, and of a clock, that count as noise
 _MOST_BAD = 0.05  # share of bad times that the reader states as its limit
-_ODDS = {  # of each value of a convention
+_ODDS: dict[str, dict[Any, int]] = {  # of each value of a convention
     "point_times": {"driver": 1, "header": 5, "sweep": 4, "epoch": 4, "boot": 6, "constant": 1, "none": 1},
     "point_unit": {"s": 1, "ms": 1, "us": 1, "ns": 1},
     "point_type": {"f4": 1, "f8": 1, "u4": 1},
@@ -212,7 +212,7 @@ def build_case(drive: Drive, case: Case, path: Path) -> Float[np.ndarray, "n m"]
 
 def measure(config: RecordingsConfig) -> tuple[list[Row], list[float]]:
     """Writes and reads all recordings; builds some. Returns their rows, and the largest difference of each bore, m."""
-    rows, apart = _known(config.out / "rows.jsonl")[: config.count], []
+    rows, apart = _known(config.out / "rows.jsonl")[: config.count], list[float]()
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         drive = drive_through(config, folder)
@@ -260,6 +260,8 @@ def properties(row: Row) -> Iterator[str]:
 
 def run(config: RecordingsConfig) -> int:
     """Measures, prints, writes; 1 where a recording was wrong in silence."""
+    if config.count < 1:
+        raise BenchmarkError(f"count must be at least 1, got {config.count}")
     config.out.mkdir(parents=True, exist_ok=True)
     rows, apart = measure(config)
     counts = Counter((kind, row.outcome) for row in rows for kind in properties(row))

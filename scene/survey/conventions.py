@@ -114,7 +114,7 @@ class Recorder:
     def __init__(self, path: Path, kinds: dict[str, str], convention: Convention) -> None:
         """`path` is the name of a bag of ROS 1; other recordings become a folder of its name without the ending."""
         self._kinds, self._convention, self._stack = kinds, convention, ExitStack()
-        self._folder: Path | None = None
+        self._folder = path.parent  # where the parts go
         self._writer: Any = None
         self._topics: dict[str, Any] = {}
         self._ros1 = convention.container == "bag"
@@ -122,7 +122,8 @@ class Recorder:
         self._path, self.path, self._part = path, path if self._alone else path.with_suffix(""), -1
 
     def __enter__(self) -> "Recorder":
-        self._folder = None if self._alone else self._stack.enter_context(replace_folder(self.path))
+        if not self._alone:
+            self._folder = self._stack.enter_context(replace_folder(self.path))
         self.start_part()
         return self
 
@@ -131,7 +132,7 @@ class Recorder:
     ) -> None:
         if self._writer is not None:
             self._writer.__exit__(kind, error, trace)
-        if error is None and not self._ros1 and self._folder is not None:
+        if error is None and not self._ros1:
             _join_parts(self._folder, self._path.stem, self._part + 1)
         self._stack.__exit__(kind, error, trace)
 
@@ -141,8 +142,9 @@ class Recorder:
             self._writer.__exit__(None, None, None)
         self._part += 1
         if self._ros1:
-            whole = self._stack.enter_context(replace_file(self._path)) if self._folder is None else None
-            self._writer, store = Writer1(whole or self._folder / f"{self._path.stem}_{self._part}.bag"), STORE
+            part = self._folder / f"{self._path.stem}_{self._part}.bag"
+            self._writer = Writer1(self._stack.enter_context(replace_file(self._path)) if self._alone else part)
+            store = STORE
         else:
             plugin, store = _PLUGINS[self._convention.container], _ROS2
             self._writer = Writer2(self._folder / f"{self._path.stem}_{self._part}", version=9, storage_plugin=plugin)
