@@ -173,7 +173,7 @@ def _fit_cloud(placed: Placed, config: ReconstructConfig, progress: Stages) -> R
     cleaned, everything, first = keep_stations(cleaned, everything, config.extent)
     cloud = cleaned.cloud
     stage.advance()
-    sections, smooth = fit_unfolded(cloud, cleaned.axis, config.centreline.cutoff)
+    sections, smooth = fit_unfolded(cloud, cleaned.axis, config.centreline.cutoff, cleaned.behind)
     stage.advance()
     seen = measure_gauge(find_track(cloud, smooth, sections.flat_floor), placed.low, smooth)
     stage.advance()

@@ -75,7 +75,7 @@ MISTAKES = {
     "train.release empty --out text.txt/o.safetensors": "text.txt: is a file",
     "scene.export empty --to glb": "empty: not a scene folder",
     "scene.export empty --to moon": "'moon'",
-    "scene.export tunnel --to urdf --out text.txt": "text.txt: must end in .urdf",
+    "scene.export tunnel --to usd --out text.txt": "text.txt: must end in .usda",
     "train.walk --out o --robots 0": "robots must be at least 1",
     "train.walk --out o --scene empty": "empty/tunnel.npz: no such tunnel file",
     "train.walk --out o --release text.txt/x.safetensors": "text.txt: is a file",

@@ -14,6 +14,7 @@ from scipy.ndimage import maximum_filter1d
 from scipy.spatial import cKDTree
 
 from scene.cleaning.follow import N_RAYS, Course, Seed, find_seeds, follow_bore, join_courses
+from scene.cleaning.planes import find_plane_walls
 from scene.cleaning.removed import Cause, Cleaned, list_removed, part_of_cloud
 from scene.cleaning.sort import end_stations, has_support, look_around, name_bodies, sort_points
 from scene.cleaning.tube import Tube, measure_tube
@@ -73,18 +74,21 @@ def clean_cloud(cloud: Cloud, config: CleaningConfig, centreline: CentrelineConf
         cause[:] = Cause.KEPT
     kept = cloud if (cause == Cause.KEPT).all() else part_of_cloud(cloud, np.flatnonzero(cause == Cause.KEPT))
     usual = _usual_section(axis, tube)
+    along = axis.at(tube.behind[:, 0])
+    hidden = along.position + tube.behind[:, 1:2] * along.lateral + tube.behind[:, 2:] * along.up
     axis = axis.at(np.linspace(*ends, int(np.ptp(ends)) + 1))
     axis = centre_axis(kept.points, axis, centreline, usual)
     removed = list_removed(cloud, cause, look_around(points, axis).station, _STRETCH, behind)
     warning = next((part.warning for part in removed if part.warning), "")
     if config.strict and warning:
         raise FitError(warning, Refusal.BRANCH)
-    return Cleaned(kept, axis, removed, cause)
+    return Cleaned(kept, axis, removed, cause, hidden)
 
 
 def _filter(cause: Int[np.ndarray, " n"], config: CleaningConfig) -> Int[np.ndarray, " n"]:
     """Return the causes with those that the user wants kept as the bore's."""
-    out = {Cause.SCATTERED: config.filter_outliers, Cause.INSIDE: config.filter_moving}
+    moving = config.filter_moving
+    out = {Cause.SCATTERED: config.filter_outliers, Cause.INSIDE: moving, Cause.STANDING: moving}
     result = cause.copy()
     result[np.isin(cause, [kind for kind, leave in out.items() if not leave])] = Cause.KEPT
     return result
@@ -99,6 +103,7 @@ def _sorted_coarse(
     """
     around = look_around(coarse, axis)
     tube = measure_tube(around.station, around.angle, around.radius, count, axis.length, reach)
+    tube = find_plane_walls(tube, around)
     ends = end_stations(tube, around)
     return tube, ends, sort_points(around, tube, np.ones(len(coarse), bool), ends)[1] == Cause.KEPT
 

@@ -16,7 +16,6 @@ from scene.geometry import Axis, make_axis
 _FLAG = tyro.conf.arg(prefix_name=False)
 _AXIS_STEP = 1.0  # m
 _SHORTEST = 5.0  # m between `--from` and `--to`
-_BESIDE = 15.0  # m from the axis: further is no portal of this tunnel
 
 
 @dataclass(frozen=True)
@@ -28,54 +27,27 @@ class ExtentConfig:
     # First station that is built, m, counted as the whole build counts them.
     first: Annotated[float | None, tyro.conf.arg(name="from", prefix_name=False)] = None
     last: Annotated[float | None, tyro.conf.arg(name="to", prefix_name=False)] = None  # Last station, m.
-    # A point at each portal, in the input's frame, between which the tunnel is built, m: x,y,z,x,y,z, or x,y,x,y.
-    portals: Annotated[str | None, _FLAG] = None
     reverse: Annotated[bool, _FLAG] = False  # Count stations from the other end.
     start_chainage: Annotated[float, _FLAG] = 0.0  # Chainage of station 0, m, for people and the manifest.
 
 
-def parse_box(text: str) -> np.ndarray:
-    """Return the corners of a box, lower first, `(2, 3)`, m; infinite in height where only the plan is given.
+def parse_box(text: str) -> Float[np.ndarray, "2 3"]:
+    """Return the corners of a box, lower first, m; infinite in height where only the plan is given.
 
     Raises `FitError` for a text that is neither four nor six numbers, or a box without a volume.
     """
-    pair = np.sort(_parse_pair(text, "--crop", "corners"), axis=0)
-    corners = np.array([[-np.inf] * 3, [np.inf] * 3])
-    corners[:, : pair.shape[1]] = pair
-    if (corners[0] >= corners[1]).any():
-        raise FitError(f"--crop {text}: the box is empty")
-    return corners
-
-
-def _parse_pair(text: str, flag: str, what: str) -> Float[np.ndarray, "2 k"]:
-    """Return two points in space or in plan, m; raises `FitError` for a text that is neither four nor six numbers."""
     try:
         numbers = np.array([float(word) for word in text.replace(",", " ").split()])
     except ValueError:
         numbers = np.empty(0)
     if len(numbers) not in (4, 6) or not np.isfinite(numbers).all():
-        raise FitError(f"{flag} is x,y,z,x,y,z of two {what} or x,y,x,y in plan, in m, got {text!r}")
-    return numbers.reshape(2, -1)
-
-
-def portal_stations(text: str, axis: Axis, origin: Float[np.ndarray, "3"]) -> tuple[float, float]:
-    """Return the stations of an axis that are nearest to two portals, the lower first, m.
-
-    `origin` is that of the axis' frame in the input's, m. Raises `FitError` where the text is no pair of points, or a
-    point is further than 15 m from the axis.
-    """
-    pair = _parse_pair(text, "--portals", "points")
-    dims = pair.shape[1]
-    stations = []
-    for point in pair - origin[:dims]:
-        distance = np.linalg.norm(axis.position[:, :dims] - point, axis=1)
-        if distance.min() > _BESIDE:
-            told = ", ".join(f"{value:.1f}" for value in point + origin[:dims])
-            raise FitError(f"--portals: ({told}) is {distance.min():.0f} m from the axis of the tunnel")
-        k = int(np.argmin(distance))
-        ahead = float((point - axis.position[k, :dims]) @ axis.tangent[k, :dims])
-        stations.append(float(axis.station[k]) + ahead)
-    return min(stations), max(stations)
+        raise FitError(f"--crop is x,y,z,x,y,z of two corners or x,y,x,y in plan, in m, got {text!r}")
+    pair = np.sort(numbers.reshape(2, -1), axis=0)
+    corners = np.array([[-np.inf] * 3, [np.inf] * 3])
+    corners[:, : pair.shape[1]] = pair
+    if (corners[0] >= corners[1]).any():
+        raise FitError(f"--crop {text}: the box is empty")
+    return corners
 
 
 def crop_cloud(cloud: Cloud, crop: str | None) -> Cloud:
@@ -104,24 +76,19 @@ def keep_stations(cleaned: Cleaned, everything: Cloud, config: ExtentConfig) -> 
     """Keep what lies between two stations, counted from the first one that enough was seen of, as the whole build does.
 
     Returns both clouds, cut, and the station of the whole build at which the rest begins, m. Raises `FitError` where
-    the stations leave less than 5 m, a portal is not at the tunnel, or both are told.
+    the stations leave less than 5 m.
     """
-    if config.first is None and config.last is None and config.portals is None:
+    if config.first is None and config.last is None:
         return cleaned, everything, 0.0
     axis = cleaned.axis
     whole = axis.at(np.arange(-OVERRUN, axis.length + OVERRUN, DENSE_STEP))
     station, lateral, upward = whole.local(cleaned.cloud.points.astype(np.float64))
     start, end = visible_span(station, np.arctan2(upward, lateral), axis)
-    first, last, told = config.first or 0.0, end - start if config.last is None else config.last, ""
-    if config.portals is not None:
-        if config.first is not None or config.last is not None:
-            raise FitError("--portals and --from or --to both say where the tunnel ends; give one of them")
-        low, high = portal_stations(config.portals, whole, cleaned.cloud.origin)
-        first, last, told = max(low - start, 0.0), high - start, f"--portals {config.portals}"
+    first, last = config.first or 0.0, end - start if config.last is None else config.last
     last = min(last, end - start)
     if last - first < _SHORTEST:
         raise FitError(
-            f"{told or f'--from {first:g} and --to {last:g}'} leave {max(last - first, 0.0):.1f} m of a tunnel of "
+            f"--from {first:g} and --to {last:g} leave {max(last - first, 0.0):.1f} m of a tunnel of "
             f"{end - start:.1f} m; at least {_SHORTEST:g} m are needed"
         )
     low, high = start + first, start + last
@@ -129,7 +96,7 @@ def keep_stations(cleaned: Cleaned, everything: Cloud, config: ExtentConfig) -> 
     all_stations = whole.local(everything.points.astype(np.float64))[0]
     rows = np.flatnonzero((all_stations >= low) & (all_stations <= high))
     removed = tuple(part.shifted(-low) for part in cleaned.removed if part.end > low and part.start < high)
-    short = Cleaned(kept, _part_of_axis(axis, low, high), removed, cleaned.cause[rows])
+    short = Cleaned(kept, _part_of_axis(axis, low, high), removed, cleaned.cause[rows], cleaned.behind)
     return short, part_of_cloud(everything, rows), first
 
 

@@ -21,6 +21,7 @@ class Cause(IntEnum):
     BEYOND = 4
     BRANCH = 5
     ELSEWHERE = 6
+    STANDING = 7
 
     @property
     def words(self) -> str:
@@ -35,8 +36,9 @@ _WORDS = (
     "terrain or a cutting beyond a mouth",
     "a branch or a recess",
     "another tunnel or building apart from the bore",
+    "things that stand along a plane wall",
 )
-OUTSIDE = (Cause.BEYOND, Cause.BRANCH, Cause.ELSEWHERE)  # of the bore: no model of it need explain them
+OUTSIDE = (Cause.BEYOND, Cause.BRANCH, Cause.ELSEWHERE, Cause.STANDING)  # of the bore: no model of it need explain them
 
 _ROOT = 20  # percent of a branch's points, those nearest the bore, that are its mouth
 _BRANCH = 3.0  # m behind the wall: less is a niche
@@ -107,6 +109,7 @@ class Cleaned:
     axis: Axis  # Centreline of the bore, m
     removed: tuple[Removed, ...]  # By station of `axis`, m
     cause: Int[np.ndarray, " n"]  # `Cause` of each point of the uncleaned cloud
+    behind: Float[np.ndarray, "k 3"]  # Places on plane walls, where things may hide them, m
 
 
 def part_of_cloud(cloud: Cloud, rows: Int[np.ndarray, " k"]) -> Cloud:

@@ -104,6 +104,8 @@ def sort_points(
     inside = (within > _INSIDE) & (height > _TRACK)
     cause[inside] = Cause.INSIDE
     cause[_footprint(around, inside & (height < _TRACK + _FOOT)) & (height > _ABOVE) & (within > _ALONE)] = Cause.INSIDE
+    standing = tube.before_plane(around.station, angle) & (within > _ALONE) & (height > _ABOVE)
+    cause[standing] = Cause.STANDING
     cause[~supported & (np.maximum(out, within) > _ALONE)] = Cause.SCATTERED
     beyond = (around.station < ends[0]) | (around.station > ends[1])
     cause[beyond] = Cause.BEYOND

@@ -9,7 +9,7 @@ at once; otherwise something stands in the bore, or opens beside it.
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.ndimage import (
     binary_closing,
     binary_opening,
@@ -49,6 +49,8 @@ class Tube:
     seen: Bool[np.ndarray, "rows cols"]  # A row around showed it
     matched: Bool[np.ndarray, "rows cols"]  # This row itself has returns on it
     closed: Bool[np.ndarray, "rows cols"]  # This row has returns no further than a flare may open
+    plane: Bool[np.ndarray, "rows cols"]  # A plane wall, before which things may stand
+    behind: Float[np.ndarray, "k 3"]  # Station, lateral and upward offset of places on such walls, m
 
     def off(
         self, station: Float[np.ndarray, " n"], angle: Float[np.ndarray, " n"], radius: Float[np.ndarray, " n"]
@@ -57,14 +59,18 @@ class Tube:
 
         Beyond the ends the last row counts.
         """
-        cell = self.grid.cell(np.clip(station, self.grid.start, self._end - 1e-6), angle)
+        cell = self._cell(station, angle)
         furthest = maximum_filter(self.wall, 3, mode=("nearest", "wrap")).ravel()[cell]
         nearest = minimum_filter(self.wall, 3, mode=("nearest", "wrap")).ravel()[cell]
         return radius - furthest, nearest - radius
 
-    @property
-    def _end(self) -> float:
-        return self.grid.start + self.grid.rows * self.grid.step
+    def before_plane(self, station: Float[np.ndarray, " n"], angle: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+        """Return which points lie in a direction in which things hide a plane wall."""
+        return self.plane.ravel()[self._cell(station, angle)]
+
+    def _cell(self, station: Float[np.ndarray, " n"], angle: Float[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+        end = self.grid.start + self.grid.rows * self.grid.step
+        return self.grid.cell(np.clip(station, self.grid.start, end - 1e-6), angle)
 
 
 def measure_tube(
@@ -104,7 +110,7 @@ def measure_tube(
     matched[row[on], column[on]] = True
     nearest = np.where(hit.any(axis=2), hit.argmax(axis=2) * _BIN, np.inf)
     closed = nearest < np.maximum(wall + _DIFFERENT, _WIDEST * usual)
-    return Tube(grid, wall, usual, np.isfinite(present), matched, closed)
+    return Tube(grid, wall, usual, np.isfinite(present), matched, closed, np.zeros(wall.shape, bool), np.empty((0, 3)))
 
 
 _DOWN = -0.5  # sine of the highest direction in which a floor lies

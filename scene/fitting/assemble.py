@@ -181,13 +181,15 @@ def find_fold(bore: Bore) -> float | None:
 _STRAIGHTER = 3  # times that an axis is smoothed over twice the length
 
 
-def fit_unfolded(cloud: Cloud, axis: Axis, cutoff: float) -> tuple[Sections, Bore]:
+def fit_unfolded(
+    cloud: Cloud, axis: Axis, cutoff: float, behind: Float[np.ndarray, "k 3"] | None = None
+) -> tuple[Sections, Bore]:
     """Fits sections to an axis, which is smoothed further where they fold: at a jump of the wall it may bend sharply.
 
-    `cutoff` is the wavelength that the axis is smooth over, m.
+    `cutoff` is the wavelength that the axis is smooth over, m; see `fit_sections` for `behind`.
     """
     for power in range(1, _STRAIGHTER + 2):
-        sections = fit_sections(cloud, axis)
+        sections = fit_sections(cloud, axis, behind)
         bore = bore_from_sections(axis, sections)
         if power > _STRAIGHTER or find_fold(bore) is None:
             break

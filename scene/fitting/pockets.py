@@ -2,8 +2,8 @@
 
 A pocket is a hole in the returns that lie on the wall, with returns behind it. Seen along the tunnel its back is mostly
 hidden by its own edge, so that one pocket says little about its depth or size. But the pockets of a lining come from
-one mould, and all of them together say it well. They stand in rows along the bore, either side of every ring joint; or
-anywhere around it, where rings are turned, but at the same places along each ring.
+one mould, and all of them together say it well. They stand in rows along the bore, either side of every ring joint.
+Pockets of turned rings stand in no rows and are not looked for.
 
 Ring joints show by steps, too: segments stand a few millimetres apart. One step is lost in the noise. But rings are
 alike in length, so that the mean square of all steps, folded to one ring, peaks at the joint, whatever segments and
@@ -16,14 +16,7 @@ from scipy.ndimage import binary_dilation, maximum_filter, uniform_filter, unifo
 from scipy.spatial import cKDTree
 
 from scene.bore import POCKET
-from scene.fitting.evidence import (
-    find_ring,
-    more_than_chance,
-    odds_by_place,
-    open_rims,
-    pocket_over_wall,
-    turned_more_than_chance,
-)
+from scene.fitting.evidence import more_than_chance, odds_by_place, open_rims, pocket_over_wall
 from scene.fitting.mould import (
     CLEAR,
     MIN_DEPTH,
@@ -200,9 +193,6 @@ _MIN_SEEN = 0.6  # of the wall
 _NOISE_SHARE = 0.25  # of the depth
 _RIB = 0.02  # least wall left between two pockets, and before a mouth, m
 _OPEN_RIM, _USUAL_RIM = 0.35, 0.15  # share of the wall missing around one hole that is no pocket, and around the usual
-_ALL_ROWS = 0.95  # of the clear holes at the places of rings
-_MATE = 0.15  # m between a hole moved on by a ring and the next
-_MIN_REPEATED = 0.5  # of them; nine tenths in rows, a third or less where every ring is turned
 _RIMS = (11, 9)  # cells about the middle of a hole that are it or its rim
 _THROUGH = 0.05  # of the pockets
 _SAME_JOINT = 0.1  # m
@@ -211,9 +201,8 @@ _SAME_JOINT = 0.1  # m
 def find_pockets(sections: Sections) -> tuple[Shaped[np.ndarray, " p"], Float[np.ndarray, " r"]]:
     """Finds the pockets that a survey shows, of `scene.bore.POCKET`, and the ring joints between them, m.
 
-    Position is each pocket's own; length, width and depth are common to all. Holes that stand neither in rows nor at
-    the same places of every ring, have no rims, or could be chance are no pockets: both results are empty then. Joints
-    of turned rings are empty where the wall shows no steps there.
+    Position is each pocket's own; length, width and depth are common to all. Holes that stand in no rows, have no rims,
+    or could be chance are no pockets: both results are empty then.
     """
     deficit = _deficit(sections)
     faint = _find_holes(deficit, sections)
@@ -221,14 +210,9 @@ def find_pockets(sections: Sections) -> tuple[Shaped[np.ndarray, " p"], Float[np
     reach = _ROW_WIDTH / (2 * np.pi * np.median(sections.radius) / sections.grid.columns)
     rows = keep_rows(weak, sections.grid.columns, reach)
     pockets, joints = _pockets_in_rows(deficit, sections, faint, rows, reach)
-    turned, pitch = _keep_turned(deficit, sections, weak)
-    if len(turned.row) and not (len(pockets) and _are_rows(rows, turned, sections, pitch)):
-        anywhere = _measure_pockets(deficit, sections, turned)
-        pockets, joints = (anywhere, np.empty(0)) if len(anywhere) else (pockets, joints)
     if not len(pockets):
-        return pockets, np.empty(0)
-    pitch = float(np.diff(joints).mean()) if len(joints) else pitch
-    return pockets, _correct_joints(joints, _joints_by_steps(sections, weak, pockets, pitch))
+        return pockets, joints
+    return pockets, _correct_joints(joints, _joints_by_steps(sections, weak, pockets, float(np.diff(joints).mean())))
 
 
 def _pockets_in_rows(
@@ -246,36 +230,6 @@ def _pockets_in_rows(
     return (pockets, joints) if more_than_chance(pockets, joints, _PITCHES, radius) else nothing
 
 
-def _keep_turned(deficit: np.ndarray, sections: Sections, holes: Holes) -> tuple[Holes, float]:
-    """Return the holes at the places that all rings share, none where that could be chance, and the pitch, m."""
-    none = holes.where(np.zeros(len(holes.row), bool))
-    clear = holes.score > CLEAR
-    if clear.sum() < _MIN_POCKETS:
-        return none, 0.0
-    length = sections.grid.rows * sections.grid.step
-    station = (refine_positions(deficit, sections, holes)[0] + 0.5) * sections.grid.step
-    ring = find_ring(station[clear], length, _PITCHES)
-    if not turned_more_than_chance(station[clear], ring, length, _PITCHES):
-        return none, 0.0
-    return holes.where(ring.holds(station)), ring.pitch
-
-
-def _are_rows(rows: Holes, turned: Holes, sections: Sections, pitch: float) -> bool:
-    """Return whether rows hold nearly all clear holes that stand at the places of rings, most of them in every ring.
-
-    Turned rings put a hole on nearly every line along the bore, and seldom two on one after the other.
-    """
-    clear = turned.where(turned.score > CLEAR)
-    columns, girth = sections.grid.columns, 2 * np.pi * float(np.median(sections.radius))
-    in_rows = np.isin(clear.row * columns + clear.column, rows.row * columns + rows.column)
-    at = np.column_stack([clear.row * sections.grid.step, clear.column * girth / columns])
-    ahead = at + np.array([pitch, 0.0])
-    last = ahead[:, 0] < at[:, 0].max() + _MATE
-    tree = cKDTree(np.mod(at, [np.inf, girth]), boxsize=[2 * (at[:, 0].max() + pitch) + 1.0, girth])
-    repeated = tree.query(np.mod(ahead[last], [np.inf, girth]))[0] < _MATE
-    return bool(in_rows.mean() > _ALL_ROWS and repeated.mean() > _MIN_REPEATED)
-
-
 def _keep_likely(deficit: np.ndarray, sections: Sections, holes: Holes) -> tuple[Holes, Float[np.ndarray, " k"]]:
     """Return the holes that are likelier pockets like the clear ones than wall, and the odds of it, as a logarithm."""
     grid, clear = sections.grid, holes.score > CLEAR
@@ -284,7 +238,8 @@ def _keep_likely(deficit: np.ndarray, sections: Sections, holes: Holes) -> tuple
     odds = pocket_over_wall(sections, middle, common_size(deficit, sections, holes, slopes(sections, holes)))
     if clear.any():
         station = (row + 0.5) * grid.step
-        odds = odds_by_place(odds, station, find_ring(station[clear], grid.rows * grid.step, _PITCHES).pitch)
+        joints = find_ring_joints(station[clear], grid.rows * grid.step)
+        odds = odds_by_place(odds, station, float(np.median(np.diff(joints)))) if len(joints) > 1 else odds
     return holes.where(odds >= 0.0), odds[odds >= 0.0]
 
 
@@ -330,8 +285,8 @@ def _joints_by_steps(
 
 def _correct_joints(joints: Float[np.ndarray, " r"], by_steps: Float[np.ndarray, " r"]) -> Float[np.ndarray, " r"]:
     """Return the joints by steps where those between pockets are elsewhere in the ring, m."""
-    if not len(by_steps) or not len(joints):
-        return by_steps if len(by_steps) else joints
+    if not len(by_steps):
+        return joints
     pitch = float(np.diff(joints).mean())
     apart = np.mod(joints[0] - by_steps[0] + 0.5 * pitch, pitch) - 0.5 * pitch
     return joints if abs(apart) < _SAME_JOINT else by_steps

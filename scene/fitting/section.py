@@ -2,8 +2,8 @@
 
 A coarse grid of medians gives a first wall that pockets, rails and people cannot move. The mean residual of small
 cells against it, cleaned of such things and smoothed over a few decimetres, gives the wall itself. Where the survey
-is profiles some way apart, the wall between them is kriged instead. A flat floor is fitted as a line under the track,
-and the walls are extended into its corners.
+is profiles some way apart, the wall follows a curve through them. A flat floor is fitted as a line under the
+track, and the walls are extended into its corners.
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,6 @@ from scene.cloud import Cloud
 from scene.errors import FitError, Refusal
 from scene.fitting import unroll
 from scene.fitting.floor import Floors, clip_to_floor, extend_to_floor, find_floors, is_floor
-from scene.fitting.kriging import krige_profiles
 from scene.fitting.unroll import Grid, fill_sides
 from scene.geometry import N_ANGLES, Axis, angle_bins
 
@@ -156,22 +155,30 @@ class _Points:
     radius: np.ndarray
     weight: np.ndarray
 
+    @classmethod
+    def about(cls, station: np.ndarray, lateral: np.ndarray, upward: np.ndarray, weight: np.ndarray) -> "_Points":
+        return cls(station, np.arctan2(upward, lateral), np.hypot(lateral, upward), weight)
+
+    def medians(self, grid: Grid) -> Float[np.ndarray, "rows cols"]:
+        return unroll.cell_medians(grid, grid.cell(self.station, self.angle), self.radius)
+
     def outward_of(self, wall: np.ndarray, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
         """Return the cell of each point, -1 outside the grid, and its distance outward of the wall, m."""
         cell = grid.cell(self.station, self.angle)
         return cell, self.radius - wall.ravel()[np.maximum(cell, 0)]
 
 
-def fit_sections(cloud: Cloud, axis: Axis) -> Sections:
+def fit_sections(cloud: Cloud, axis: Axis, behind: Float[np.ndarray, "k 3"] | None = None) -> Sections:
     """Fits the sections from one end of the seen bore to the other; stations are those of `axis`.
 
-    The axis may stop short of the ends or run over them by 3 m. Raises `FitError` where less than half of the surface
+    The axis may stop short of the ends or run over them by 3 m. `behind` are places of the wall, m, that stand in for
+    returns where there are none. Raises `FitError` where less than half of the surface
     was seen, or its middle is not open.
     """
-    station, lateral, upward = axis.at(np.arange(-OVERRUN, axis.length + OVERRUN, DENSE_STEP)).local(
-        cloud.points.astype(np.float64)
-    )
-    points = _Points(station, np.arctan2(upward, lateral), np.hypot(lateral, upward), cloud.weights)
+    whole = axis.at(np.arange(-OVERRUN, axis.length + OVERRUN, DENSE_STEP))
+    station, lateral, upward = whole.local(cloud.points.astype(np.float64))
+    points = _Points.about(station, lateral, upward, cloud.weights)
+    stand_in = None if behind is None or not len(behind) else _Points.about(*whole.local(behind), np.ones(len(behind)))
     start, end = visible_span(station, points.angle, axis)
     step = profile_spacing(station, start, end)
     floors = find_floors(station, lateral, upward, start, end, axis)
@@ -179,18 +186,16 @@ def fit_sections(cloud: Cloud, axis: Axis) -> Sections:
     steps = [step, *(longer for longer in _THIN_STEPS if longer > step)]
     grids = [Grid.over(start, end, length, _COARSE_ANGLES) for length in steps]
     coarse = next((grid for grid in grids if _share_of_cells(points, grid) >= _MIN_COVERAGE), grids[0])
-    wall = _first_wall(points, coarse, fine, floors)
+    wall = _first_wall(points, coarse, fine, floors, stand_in)
     _require_open_middle(points, fine, wall)
     if step > DENSE_STEP:
-        kriged = krige_profiles(points.station, points.angle, points.radius, fine)
-        wall = kriged.wall
+        wall, seen = unroll.interpolate_profiles(points.station, points.angle, points.radius, fine)
         if floors is not None:
             wall = clip_to_floor(extend_to_floor(wall, fine, floors, wall), fine, floors)
-        return _measure_wall(points, wall, kriged.sigma, fine, floors is not None, cloud.voxel, step)
-    wall, seen = _follow_wall(points, wall, fine, floors)
-    return _measure_wall(
-        points, wall, unroll.estimate_sigma(wall, seen, fine), fine, floors is not None, cloud.voxel, 0.0
-    )
+    else:
+        wall, seen = _follow_wall(points, wall, fine, floors)
+    sigma, spacing = unroll.estimate_sigma(wall, seen, fine), step if step > DENSE_STEP else 0.0
+    return _measure_wall(points, wall, sigma, fine, floors is not None, cloud.voxel, spacing)
 
 
 def _share_of_cells(points: _Points, grid: Grid) -> float:
@@ -198,11 +203,14 @@ def _share_of_cells(points: _Points, grid: Grid) -> float:
     return float((np.bincount(cell[cell >= 0], minlength=grid.rows * grid.columns) > 0).mean())
 
 
-def _first_wall(points: _Points, coarse: Grid, fine: Grid, floors: Floors | None) -> np.ndarray:
-    wall = unroll.cell_medians(coarse, coarse.cell(points.station, points.angle), points.radius)
+def _first_wall(
+    points: _Points, coarse: Grid, fine: Grid, floors: Floors | None, stand_in: _Points | None
+) -> np.ndarray:
+    wall = points.medians(coarse)
     if np.isfinite(wall).mean() < _MIN_COVERAGE:
         why = f"only {np.isfinite(wall).mean():.0%} of the bore's surface was seen; at least half is needed"
         raise FitError(why, Refusal.UNSEEN)
+    wall = wall if stand_in is None else np.where(np.isnan(wall), stand_in.medians(coarse), wall)
     wall = fill_sides(unroll.fill_holes(wall, _LARGE_HOLE), coarse.angle, round(_GOES_ON / coarse.step))
     window = (round(_MEDIAN_WINDOW[0] / coarse.step) // 2 * 2 + 1, _MEDIAN_WINDOW[1])
     along = unroll.median_smooth(unroll.fill_nearest(wall), (window[0], 1))

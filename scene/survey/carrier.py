@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from scene.survey.alignment import Alignment
+from scene.survey.bore import Bore
 from scene.survey.config import LidarName, SensorErrors
 from scene.survey.section import draw_field
 
@@ -156,25 +156,6 @@ class Poses:
     quaternion: Float[np.ndarray, "n 4"]  # x, y, z, w; takes LiDAR vectors to the survey frame
 
 
-class Heights(Protocol):
-    """The height of a bore by station."""
-
-    def height(self, station: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-        """Return the height from the floor to the crown on the axis, m."""
-
-
-class Passage(Protocol):
-    """The bore that a carrier walks along: a drawn one, or that of a tunnel file."""
-
-    @property
-    def alignment(self) -> Alignment:
-        """Return the centreline, through the middle of width and height."""
-
-    @property
-    def section(self) -> Heights:
-        """Return the height of its sections."""
-
-
 class Motion(Protocol):
     """The motion of a rack along a bore: a carried `Walk`, or a drive of `benchmarks.slam.arena`."""
 
@@ -193,7 +174,7 @@ class Motion(Protocol):
 class Walk:
     """The carried LiDAR's motion."""
 
-    bore: Passage  # The bore walked through
+    bore: Bore  # The bore walked through
     speed: float  # Mean speed, m/s
     duration: float  # Length of the survey, s
     ahead: Sway  # Sway of the position along the centreline, m
@@ -243,7 +224,7 @@ class Carried:
         return Poses(position, quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True))
 
 
-def draw_walk(rng: np.random.Generator, bore: Passage, speed: float, period: float) -> Walk:
+def draw_walk(rng: np.random.Generator, bore: Bore, speed: float, period: float) -> Walk:
     """Draws a walk through `bore`, a whole number of scans of `period` s long."""
     duration = period * np.ceil((bore.alignment.length + STOP - START) / speed / period)
     degree = np.pi / 180.0

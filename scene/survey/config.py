@@ -48,9 +48,6 @@ class SurveyConfig:
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]  # Folder to write to; made if missing.
     # Kind of bore; from `portal` on places as scanners meet them.
     truth: TruthName = "paper"
-    # A tunnel file to survey instead: of a scene, or of `st.tunnel.save_tunnel`.
-    truth_file: Path | None = None
-    lining: str = ""  # Lining of the tunnel file; `pockets`, or its first, if not given.
     length: float = 60.0  # Length of the bore along its centreline, m.
     seed: int = 0  # Draws all that is random; the same seed gives the same bytes.
     # Draw sizes (gauge, rings, pockets ...) within building tolerance.
@@ -75,10 +72,6 @@ def check_survey(config: SurveyConfig) -> None:
         raise ValueError(f"length must be more than 10 m and at most 2000 m, got {config.length:g}")
     if config.truth == "metro" and config.length > METRO_LENGTH:
         raise ValueError(f"length must be at most {METRO_LENGTH:g} m for truth metro, got {config.length:g}")
-    if config.truth_file is None and config.lining:
-        raise ValueError("lining goes with truth-file alone")
-    if config.truth_file is not None and (config.truth != "paper" or config.tolerances):
-        raise ValueError("truth-file has its own bore: give neither truth nor tolerances beside it")
     if not 0.1 <= config.speed <= 10.0:
         raise ValueError(f"speed must lie between 0.1 and 10 m/s, got {config.speed:g}")
     if config.seed < 0:

@@ -77,18 +77,6 @@ def _copy_shape(
     return Mesh(vertices.reshape(-1, 3), every.reshape(-1, 3), parts, station.repeat(len(faces)))
 
 
-def box_mesh(
-    centre: Float[np.ndarray, "3"], half: Float[np.ndarray, "3 3"], taper: float, part: Part, station: float
-) -> Mesh:
-    """Return a box by its middle and half edges along, left and up, as rows, m.
-
-    Its length is less at the top than in the middle by the share `taper`, and more at the foot.
-    """
-    share = _CORNERS * 1.0
-    share[:, 0] *= 1.0 - taper * share[:, 2]
-    return _copy_shape(share, _BOX, centre[None], half.T[None], part, np.array([station]))
-
-
 def track_mesh(alignment: Alignment, section: Section, furniture: Furniture) -> Mesh:
     """Return sleepers, rails, pads and clips; each sleeper lies in the section of its own station."""
     if not furniture.tracks:

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from scene.survey import messages
-from scene.survey.bore import Bore, draw_bore
+from scene.survey.bore import draw_bore
 from scene.survey.carrier import (
     GRAVITY,
     IMUS,
@@ -26,7 +26,6 @@ from scene.survey.carrier import (
 from scene.survey.cast import Caster, n_sweeps, sweeps
 from scene.survey.config import LidarName, SurveyConfig
 from scene.survey.conventions import Convention, Recorder, encode, kind_of
-from scene.survey.given import GivenBore, describe_given, read_given
 from scene.survey.lidar import SCAN_PERIOD, Lidar, Sweep, avia, os1, vlp16
 from scene.survey.mesh import Mesh
 from scene.survey.write import CloudWriter, describe_truth, write_json, write_mesh, write_tum, write_yaml
@@ -123,20 +122,14 @@ _BEHIND = {"avia": 20.0}  # m of bore that a LiDAR sees behind itself, where it 
 def simulate(config: SurveyConfig, console: Console) -> str:
     """Writes the survey of `config`; returns a line that says what was written."""
     of_bore, of_walk, of_prism, _, of_sensors = np.random.SeedSequence(config.seed).spawn(5)
-    bore: Bore | GivenBore
-    if config.truth_file is None:
-        bore = draw_bore(of_bore, config.length, config.truth, config.correlation, config.tolerances)
-    else:
-        bore = read_given(config.truth_file, config.lining, config.length)
-        config = replace(config, length=bore.alignment.length)
+    bore = draw_bore(of_bore, config.length, config.truth, config.correlation, config.tolerances)
     config = replace(config, errors=replace(config.errors, strays=max(config.errors.strays, bore.strays)))
     mesh = bore.mesh()
     walk = draw_walk(np.random.default_rng(of_walk), bore, config.speed, SCAN_PERIOD)
     config.out.mkdir(parents=True, exist_ok=True)
 
     write_mesh(config.out / "truth.ply", mesh)
-    truth = describe_truth(bore, config) if isinstance(bore, Bore) else describe_given(bore, config)
-    write_json(config.out / "truth.json", truth)
+    write_json(config.out / "truth.json", describe_truth(bore, config))
     prism = measure_prism(np.random.default_rng(of_prism), walk, config.errors.prism_noise)
     write_tum(config.out / "prism.tum", *prism, None)
     parts = [f"{config.out}: {config.length:g} m"]

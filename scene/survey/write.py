@@ -152,7 +152,7 @@ def describe_truth(bore: Bore, config: SurveyConfig) -> dict[str, Any]:
         "provenance": "simulated",
         "section_type": bore.section_type,
         "seed": config.seed,
-        "config": {k: v for k, v in asdict(config).items() if k not in ("out", "truth_file", "lining")},
+        "config": {k: v for k, v in asdict(config).items() if k != "out"},
         "definitions": DEFINITIONS,
         "length": alignment.length,
         "station": rounded(station),

@@ -1,4 +1,4 @@
-"""Walls as irregular as a mine's, followed between profiles at least as well as by linear interpolation."""
+"""Walls as irregular as a mine's, followed between profiles at least as well as by straight lines."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,6 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import gaussian_filter
 
 from scene.bore import Bore
-from scene.fitting.kriging import Correlation, choose_correlation, predict_wall
 from tests.scene.fits import rebuilt
 
 LENGTH, SPACING, STEP, COLUMNS = 30.0, 1.0, 0.1, 180
@@ -75,7 +74,7 @@ def linear(tunnel: Irregular, profiles: np.ndarray, held: np.ndarray, wall: np.n
 
 @pytest.mark.parametrize(
     ("correlation", "mean", "within"),
-    [(1.0, 0.040, 0.94), (2.0, 0.012, 0.99), (4.0, 0.008, 0.99)],
+    [(1.0, 0.042, 0.94), (2.0, 0.012, 0.99), (4.0, 0.008, 0.99)],
 )
 def test_profiles_a_metre_apart_give_the_wall_between_them(correlation, mean, within):
     tunnel, rng = Irregular.drawn(correlation, seed=4), np.random.default_rng(8)
@@ -99,38 +98,3 @@ def test_a_person_between_two_profiles_is_no_wall():
     alone, _ = rebuilt(cloud + 50.0, LINE)
     beside, _ = rebuilt(np.concatenate([cloud, person]) + 50.0, LINE)
     assert np.abs(alone.width - beside.width).max() < 0.06
-
-
-def draw(family: str, length: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    station = np.repeat(np.arange(60.0)[:, None], 40, axis=1)
-    shape = Correlation(family, length, 1e-6, 1.0)(np.abs(station[:, :1] - station[:, 0]))
-    factor = np.linalg.cholesky(shape + 1e-8 * np.eye(60))
-    return station, 0.1 * factor @ rng.standard_normal((60, 40)) + 0.005 * rng.standard_normal((60, 40))
-
-
-@pytest.mark.parametrize(("family", "length"), [("exponential", 3.0), ("gaussian", 3.0)])
-def test_the_likeliest_correlation_is_that_which_the_values_were_drawn_from(family, length):
-    chosen, true = (
-        choose_correlation(*draw(family, length, np.random.default_rng(0))),
-        Correlation(family, length, 0, 1),
-    )
-    lag = np.array([1.0, 2.0, 3.0])
-    np.testing.assert_allclose(chosen(lag) / (1 + chosen.nugget), true(lag), atol=0.12)
-    assert chosen.sigma == pytest.approx(0.1, rel=0.35)  # a line was taken off
-
-
-def test_the_roughest_family_at_a_great_length_is_linear_interpolation():
-    station = np.array([[0.0], [1.0], [2.0], [3.0]])
-    value = np.array([[0.1], [0.3], [0.2], [0.25]])
-    model = Correlation("exponential", 1e4, 1e-12, 1.0)
-    at = np.array([0.25, 1.5, 2.9])
-    np.testing.assert_allclose(predict_wall(model, station, value, at)[0][:, 0],
-                               np.interp(at, station[:, 0], value[:, 0]), atol=1e-4)  # fmt: skip
-
-
-def test_a_prediction_keeps_what_was_seen_and_says_how_sure_it_is():
-    station, value = np.array([[0.0], [1.0], [9.0]]), np.array([[0.1], [np.nan], [-0.2]])
-    model = Correlation("gaussian", 1.0, 1e-9, 0.15)
-    mean, sigma = predict_wall(model, station, value, np.array([0.0, 4.5, 9.0]))
-    np.testing.assert_allclose(mean[:, 0], [0.1, 0.0, -0.2], atol=1e-6)
-    np.testing.assert_allclose(sigma[:, 0], [0.0, 0.15, 0.0], atol=1e-4)

@@ -54,25 +54,6 @@ def test_stations_that_leave_nothing_are_refused(bore_file):
         rebuilt(bore_file, first=22.0)
 
 
-@pytest.mark.parametrize("columns", [3, pytest.param(2, marks=pytest.mark.slow)], ids=["in space", "in plan"])
-def test_portals_keep_what_lies_between_them(bore_file, whole, columns):
-    ends = whole.bore.axis.at(np.array([7.0, 17.0])).position + whole.origin
-    ends = ends + whole.bore.lateral[0] * 1.0  # somebody's pick of a portal is seldom on the axis
-    told = ",".join(f"{value:.3f}" for value in ends[::-1, :columns].ravel())
-    part = rebuilt(bore_file, portals=told)
-    assert part.bore.length == pytest.approx(10.0, abs=0.4)
-    assert part.facts["chainage_start"] == pytest.approx(7.0, abs=0.3)
-
-
-def test_portals_that_cannot_be_used_are_refused(bore_file):
-    with pytest.raises(FitError, match=r"--portals: \(900\.0, 0\.0\) is \d+ m from the axis of the tunnel"):
-        rebuilt(bore_file, portals="900,0,12,-3")
-    with pytest.raises(FitError, match="give one of them"):
-        rebuilt(bore_file, portals="0,0,12,-3", first=2.0)
-    with pytest.raises(FitError, match=r"--portals is x,y,z,x,y,z of two points .* got '1,2,3'"):
-        rebuilt(bore_file, portals="1,2,3")
-
-
 def test_a_box_keeps_what_is_inside_it_in_the_frame_of_the_input():
     points = np.array([[0, 0, 0], [5, 0, 0], [5, 5, 9]], np.float32)
     cloud = Cloud(points, np.ones(3, np.float32), np.array([100.0, 200.0, 0.0]), 3, 0.04)

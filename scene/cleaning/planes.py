@@ -1,0 +1,122 @@
+"""Plane side walls of a box section, behind whatever stands along them.
+
+Cabinets, shelves and racks hide most of a wall, and in a sparse cloud they look like one. But above them, or between
+two of them, the wall shows up to the ceiling, and it is the same plane all along. A door set back from the wall does
+not show up to the ceiling, and an alcove not all along.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.ndimage import maximum_filter1d, median_filter, uniform_filter1d
+
+from scene.cleaning.sort import Around
+from scene.cleaning.tube import Tube
+
+_FLAT = 0.15  # m that a ceiling or a floor departs from its height, of most directions
+_INNER = 0.6  # of the half width: so much of ceiling and floor must be flat
+_STRIP = (0.08, 0.50)  # m below the ceiling, where a wall is looked for
+_SIDEWAYS = 0.95  # cosine of directions across
+_ROW = 1.0  # m of bore
+_APART = 0.1  # m between places on a wall
+_OUTERMOST = 3  # points: so many lie further out in no row but by chance
+_NEXT = 3  # rows: in one of so many the wall shows beside or above things
+_ALONG = 15  # rows in whose median a wall stays where it is
+_BEFORE, _SOME = 0.3, 0.03  # m before a wall, and share of the returns there, that things stand along it
+_HIDDEN = 0.12  # m that things stand before a wall
+_LOW = 1.2  # m above the floor: what is lower and has no gap is a walkway, a kerb or a platform, and stays
+_FOOT, _GAPS = (0.06, 0.22), 0.08  # m above the floor; share of the rows that show the wall there
+_DEEPEST = 1.6  # m: what lies further behind what is seen in most rows is another room
+
+
+def find_plane_walls(tube: Tube, around: Around) -> Tube:
+    """Return a tube of box section with its side walls where they are plane; any other tube as it was."""
+    floor, ceiling = (_level(tube, side) for side in (-1, 1))
+    if floor is None or ceiling is None:
+        return tube
+    rows = tube.grid.rows
+    row = np.floor((around.station - tube.grid.start) / tube.grid.step).astype(np.intp)
+    below = ceiling[np.clip(row, 0, rows - 1)] - around.upward
+    strip = (row >= 0) & (row < rows) & (below > _STRIP[0]) & (below < _STRIP[1])
+    plane, wall, usual = np.zeros(tube.wall.shape, bool), tube.wall, tube.usual
+    behind = []
+    for side in (1, -1):
+        facing = side * np.cos(tube.grid.angle)
+        front = np.median(tube.usual[:, facing > _SIDEWAYS], axis=1)
+        own = np.flatnonzero(strip)
+        own = own[side * around.lateral[own] < front[row[own]] + _DEEPEST]
+        across = _outermost(side * around.lateral[own], row[own], rows, round(_ROW / tube.grid.step))
+        if across is None:
+            continue
+        distance = across[:, None] / np.maximum(facing, 1e-3)
+        upward = distance * np.sin(tube.grid.angle)
+        there = (facing > 0) & (upward > floor[:, None]) & (upward < ceiling[:, None])
+        hidden = there & (tube.wall * facing < across[:, None] - _HIDDEN)
+        high = upward > floor[:, None] + _LOW
+        gaps = _shows_foot(around, row, side, across, floor, tube.grid.step)
+        whole = gaps | (hidden & high).any(axis=1)
+        there &= high | whole[:, None]
+        cell = tube.grid.cell(around.station, around.angle)
+        beside = there.ravel()[np.maximum(cell, 0)] & (cell >= 0)
+        before = side * around.lateral[beside] < across[row[beside]] - _BEFORE
+        if not (there & hidden).any() and before.mean() < _SOME:
+            continue
+        plane |= there
+        behind.append(_sample(tube, side * across, np.where(whole, floor, floor + _LOW), ceiling))
+        wall, usual = (np.where(there, np.maximum(field, distance), field) for field in (wall, usual))
+    return replace(tube, wall=wall, usual=usual, plane=plane, behind=np.concatenate(behind)) if behind else tube
+
+
+def _sample(tube: Tube, across: np.ndarray, low: np.ndarray, high: np.ndarray) -> Float[np.ndarray, "k 3"]:
+    """Return station, lateral and upward offset of places on a plane wall, m."""
+    share = np.linspace(0.0, 1.0, max(int(np.median(high - low) / _APART), 2))
+    stations = np.arange(tube.grid.station[0], tube.grid.station[-1], _APART)
+    across, low, high = (np.interp(stations, tube.grid.station, rows)[:, None] for rows in (across, low, high))
+    places = np.broadcast_arrays(stations[:, None], across, low + share * (high - low))
+    return np.stack(places, axis=-1).reshape(-1, 3)
+
+
+def _level(tube: Tube, side: int) -> Float[np.ndarray, " rows"] | None:
+    """Return the height of ceiling (1) or floor (-1) above the axis in each row, m; `None` where it is not flat."""
+    across, upward = tube.usual * np.cos(tube.grid.angle), tube.usual * np.sin(tube.grid.angle)
+    half = np.percentile(np.abs(across), 90, axis=1, keepdims=True)
+    inner = (np.abs(across) < _INNER * half) & (side * upward > 0)
+    height = np.where(inner, upward, np.nan)
+    level = np.nanmedian(height, axis=1)
+    off = np.nanpercentile(np.abs(height - level[:, None]), 80, axis=1)
+    return level if np.median(off) < _FLAT else None
+
+
+def _shows_foot(
+    around: Around, row: np.ndarray, side: int, across: np.ndarray, floor: np.ndarray, step: float
+) -> Bool[np.ndarray, " rows"]:
+    """Return the rows about which the wall shows down to the floor here and there: beside no walkway or platform."""
+    rows = len(across)
+    at = np.clip(row, 0, rows - 1)
+    height = around.upward - floor[at]
+    on_wall = np.abs(side * around.lateral - across[at]) < _HIDDEN
+    low = (row >= 0) & (row < rows) & on_wall & (height > _FOOT[0]) & (height < _FOOT[1])
+    shown = np.bincount(row[low], minlength=rows) > 0
+    return uniform_filter1d(shown.astype(float), round(_ALONG * _ROW / step), mode="nearest") > _GAPS
+
+
+def _outermost(
+    out: Float[np.ndarray, " p"], row: np.ndarray, rows: int, together: int
+) -> Float[np.ndarray, " rows"] | None:
+    """Return how far out points lie in rows of a tube, the same for most neighbours, m; `None` where few rows show it.
+
+    `together` rows are looked at as one.
+    """
+    count = -(-rows // together)
+    furthest = np.full(count, np.nan)
+    for k in range(count):
+        own = out[row // together == k]
+        if len(own) >= _OUTERMOST:
+            furthest[k] = np.partition(own, -_OUTERMOST)[-_OUTERMOST]
+    known = np.isfinite(furthest) & (furthest > 0)
+    if known.mean() < 0.5:
+        return None
+    furthest = np.interp(np.arange(count), np.flatnonzero(known), furthest[known])
+    even = median_filter(maximum_filter1d(furthest, _NEXT, mode="nearest"), _ALONG, mode="nearest")
+    return np.interp(np.arange(rows), (np.arange(count) + 0.5) * together, even)
