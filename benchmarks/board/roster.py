@@ -45,7 +45,6 @@ ROSTER = (
     Entry("random", "blind", "nothing"),
     Entry("dead-reckoning", "blind", "nothing"),
     Entry("fused", "blind", "nothing; given the sizes of the errors"),
-    Entry("ring-filter", "written", _TUNED),
     Entry("scan-matching", "written", _TUNED),
     Entry("locate-transformer", "learnt", _TRAINED, _STOPS, hidden=False),
     Entry("StopAt-v1", "learnt", f"{_TRAINED}; its speed, steering and stop by reward", _STOPS, hidden=False),

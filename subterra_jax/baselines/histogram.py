@@ -18,7 +18,6 @@ from jaxtyping import Array, Float
 
 from subterra_jax.baselines.agent import Known, Observed, range_sigma
 from subterra_jax.baselines.avoidance import steering_of
-from subterra_jax.baselines.bayes import diffuse, neighbours, normalised
 from subterra_jax.baselines.cloud import CloudParams, cloud_params
 from subterra_jax.baselines.exactscan import ExactParams, exact_likelihood
 from subterra_jax.baselines.navigator import Navigator
@@ -140,7 +139,7 @@ class HistogramLocaliser(Localiser):
         pose = move_pose(before, distance, turn, walls.curvature(before.station)[2])
         _, pose = fit(walls, dataclasses.replace(pose, station=self._stations(now)), obs.ranges, range_max, self.scan)
         log_mass = jnp.log(mass) + self._score(walls, pose, obs, params)[:, None, :]
-        log_mass = normalised(log_mass, _FLOOR)
+        log_mass = _normalised(log_mass)
         now = dataclasses.replace(now, log_mass=log_mass, lateral=pose.lateral, heading=pose.heading)
         return self._estimate(now, reckoning, params), now
 
@@ -166,7 +165,7 @@ class HistogramLocaliser(Localiser):
         heading = jnp.broadcast_to(jnp.asarray((0.0, np.pi), jnp.float32)[:ways, None], log_mass.shape)
         zero = jnp.zeros(())
         memory = HistogramMemory(
-            log_mass=normalised(log_mass[:, None, :] + rows[:, None], _FLOOR),
+            log_mass=_normalised(log_mass[:, None, :] + rows[:, None]),
             lateral=jnp.zeros_like(heading),
             heading=heading,
             origin=origin,
@@ -188,14 +187,14 @@ class HistogramLocaliser(Localiser):
         """Slides each row of errors by its share of a step, and spreads what the step adds to errors and way."""
         noise, size = self.noise, jnp.abs(along)
         change = 2.0 * noise.wander.sigma**2 / noise.wander.length * size / (_scales()[1] - _scales()[0]) ** 2
-        mass = diffuse(mass, jnp.minimum(change, 0.5), axis=1)
+        mass = _diffused(mass, jnp.minimum(change, 0.5), axis=1)
         sign = jnp.asarray((1.0, -1.0))[: mass.shape[0], None, None]
         shift = sign * jnp.asarray(_scales())[:, None] * along / self.cell
         before, after = jnp.maximum(shift, 0.0), jnp.maximum(-shift, 0.0)
-        low, high = neighbours(mass)
+        low, high = _neighbours(mass)
         mass = (1.0 - before - after) * mass + before * low + after * high
         share = jnp.where(size > 0.0, jnp.minimum((noise.step_sigma / self.cell) ** 2, 0.5), 0.0)
-        return jnp.maximum(diffuse(mass, share), np.float32(np.exp(_FLOOR)))
+        return jnp.maximum(_diffused(mass, share), np.float32(np.exp(_FLOOR)))
 
     def _score(self, walls: WallMap, pose: TunnelPose, obs: Observed, params: EnvParams) -> Float[Array, "ways n"]:
         """Computes the log likelihood of a scan in every cell."""
@@ -211,6 +210,27 @@ class HistogramLocaliser(Localiser):
         direction = facing * jnp.where(self._cosine(memory) > 0.0, 1.0, -1.0)
         station = station + direction * unobserved_distance(reckoning, jnp.asarray(params.vehicle.period))
         return Station(station, jnp.log(jnp.maximum(sigma, _LEAST_SIGMA)), direction)
+
+
+def _diffused(
+    mass: Float[Array, "*cells"], variance: Float[Array, "*#cells"], axis: int = -1
+) -> Float[Array, "*cells"]:
+    """Spread mass over neighbouring cells by a variance, in squares of a cell, up to 1; none is lost at the ends."""
+    low, high = _neighbours(mass, axis)
+    return mass + 0.5 * variance * (low + high - 2.0 * mass)
+
+
+def _neighbours(mass: Float[Array, "*cells"], axis: int = -1) -> tuple[Float[Array, "*cells"], Float[Array, "*cells"]]:
+    """Return the mass of the cell before each cell, and of the one behind it; beyond the ends as much as in them."""
+    axis %= mass.ndim
+    wide = jnp.pad(mass, [(1, 1) if i == axis else (0, 0) for i in range(mass.ndim)], mode="edge")
+    before, behind = (jax.lax.slice_in_dim(wide, first, first + mass.shape[axis], axis=axis) for first in (0, 2))
+    return before, behind
+
+
+def _normalised(log_mass: Float[Array, "*cells"]) -> Float[Array, "*cells"]:
+    """Scale a belief to a sum of 1, given and returned as logs; no cell falls below `_FLOOR`."""
+    return jnp.maximum(log_mass - jax.scipy.special.logsumexp(log_mass), _FLOOR)
 
 
 def _scales() -> np.ndarray:

@@ -140,19 +140,6 @@ class Memory:
     command: Float[Array, "2"]  # last command, m/s and rad/s
 
 
-@dataclasses.dataclass(frozen=True)
-class Pace:
-    """Limits of the speed towards a goal: a slow robot has more scans of each metre."""
-
-    cruise: float = math.inf  # largest speed, m/s
-    slow: float = 0.0  # largest speed over the first distance, m/s
-    learning: float = 0.0  # that first distance, m; 0 is none
-
-    def limit(self, target: Float[Array, ""], travelled: Float[Array, ""]) -> Float[Array, ""]:
-        """Return a target speed within the limits, m/s, after a distance commanded, m."""
-        return jnp.minimum(target, jnp.where(travelled < self.learning, self.slow, self.cruise))
-
-
 @struct.dataclass
 class Navigator:
     """An agent that localises itself, decides how far to go, and steers there.
@@ -166,7 +153,7 @@ class Navigator:
     uses_map: bool = struct.field(pytree_node=False, default=False)  # the localiser needs the map
     # distance over which it must be sure of its place before it reports, m
     sure_for: float = struct.field(pytree_node=False, default=30.0)
-    pace: Pace = struct.field(pytree_node=False, default=Pace())  # limits of its speed, where it has a goal
+    cruise: float = struct.field(pytree_node=False, default=math.inf)  # largest speed towards a goal, m/s
 
     @property
     def uses_lidar(self) -> bool:
@@ -200,7 +187,7 @@ class Navigator:
             sure_for = self.sure_for if self.uses_map else 0.0
             now = search(now, estimate, moved, obs, params, sure_for)
         target = target_speed(now, estimate, obs, params)
-        paced = target if params.errand == "cover" else self.pace.limit(target, now.travelled)
+        paced = target if params.errand == "cover" else jnp.minimum(target, self.cruise)
         command = self.steering.steer(steering, paced, params)
         command = jnp.where(is_turning(now), turn_command(now, params), command)
         limit = jnp.stack([jnp.asarray(params.vehicle.speed_max), jnp.asarray(params.vehicle.yaw_rate_max)])

@@ -17,7 +17,6 @@ from subterra_jax.baselines.histogram import NAME as HISTOGRAM
 from subterra_jax.baselines.histogram import histogram_filter
 from subterra_jax.baselines.navigator import Navigator
 from subterra_jax.baselines.particle import particle_filter
-from subterra_jax.baselines.rings.filter import ring_filter
 from subterra_jax.baselines.scanmatch import scan_matching
 from subterra_jax.baselines.stations import OdometerCount, Truth
 from subterra_jax.baselines.steering import CentreLine
@@ -92,7 +91,6 @@ def _navigator(name: str, localiser: Any) -> None:
 register("random", lambda params: Random())
 _navigator("dead-reckoning", OdometerCount())
 _navigator("fused", FusedCount())
-register("ring-filter", ring_filter)
 _navigator("oracle", Truth())
 register("scan-matching", scan_matching)
 register("particle-filter", particle_filter)

@@ -205,7 +205,7 @@ def load_policy(source: Any, env: TunnelEnv | None = None, params: EnvParams | N
 
     Args:
         source: Name of a released policy, as `StopAt-v1`; a `.safetensors` file; a run folder of `train`; a baseline by
-            name, as `ring-filter`; `module:Class` or `FILE.py:Class`; or an agent.
+            name, as `scan-matching`; `module:Class` or `FILE.py:Class`; or an agent.
         env: The environment to drive in. None is the task that the policy was trained on, in the packaged tunnel.
         params: Its params. Sizes and noises are what the policy believes of its robot.
 

@@ -73,11 +73,11 @@ def test_the_seeds_of_the_cells_on_record_are_still_drawn():
 
 
 def test_figures_beyond_a_bound_are_named_and_others_are_not():
-    fair = [cell("fused", 0.4), cell("ring-filter", 0.9), cell("ceiling", 0.95), cell("oracle", 1.0)]
+    fair = [cell("fused", 0.4), cell("scan-matching", 0.9), cell("ceiling", 0.95), cell("oracle", 1.0)]
     assert cells.find_leaks(fair) == []
     assert "fused, StopAt, cast of val: 100 % is above the floor" in cells.find_leaks([cell("fused", 1.0)])[0]
-    above = cells.find_leaks([cell("ring-filter", 1.0), cell("ceiling", 0.5)])
-    assert above == ["ring-filter, StopAt, cast of val: 100 % is above the ceiling, 50 %"]
+    above = cells.find_leaks([cell("scan-matching", 1.0), cell("ceiling", 0.5)])
+    assert above == ["scan-matching, StopAt, cast of val: 100 % is above the ceiling, 50 %"]
 
 
 def test_tables_and_records_hold_every_agent():
@@ -95,7 +95,7 @@ def test_tables_and_records_hold_every_agent():
 
 
 def test_the_picture_names_every_agent_between_floor_and_ceiling_and_marks_its_group():
-    names = ("fused", "ring-filter", "locate-map", "locate-transformer")
+    names = ("fused", "scan-matching", "locate-map", "locate-transformer")
     some = [cell(name, 0.5, splits=SPLITS) for name in (*names, "oracle")]
     figure = tables.draw([*some, cell("ceiling", 0.9, splits=SPLITS)])
     (axes,) = figure.axes
@@ -107,12 +107,12 @@ def test_the_picture_names_every_agent_between_floor_and_ceiling_and_marks_its_g
 
 
 def test_the_best_of_a_group_is_chosen_on_val_and_not_where_it_is_shown():
-    good_on_val, good_on_test = cell("ring-filter", 0.0, splits=SPLITS), cell("scan-matching", 0.0, splits=SPLITS)
+    good_on_val, good_on_test = cell("scan-matching", 0.0, splits=SPLITS), cell("fused", 0.0, splits=SPLITS)
     good_on_val["success"] = [1] * 40 + [0] * 40
     good_on_test["success"] = [0] * 40 + [1] * 40
     row = tables.screen([good_on_val, good_on_test])[0]
     agent, score = row["best written"]
-    assert (agent, score.success) == ("ring-filter", 0.0)
+    assert (agent, score.success) == ("scan-matching", 0.0)
     assert row["learnt"] is None
 
 
@@ -128,11 +128,11 @@ def test_a_cell_of_some_of_the_splits_stands_where_it_was_driven():
     text = tables.as_markdown([narrow, wide])
     assert text.index("## val by kind") < text.index("## test-unseen by kind") < text.index("| *ceiling* |")
     assert text.count("| *ceiling* |") == 1
-    above = cells.find_leaks([narrow, {**wide, "agent": "ring-filter", "success": [1] * 80}])
+    above = cells.find_leaks([narrow, {**wide, "agent": "scan-matching", "success": [1] * 80}])
     assert above == []
     narrow = {**narrow, "success": [0] * 40}
-    above = cells.find_leaks([narrow, {**wide, "agent": "ring-filter", "success": [1] * 80}])
-    assert above == ["ring-filter, StopAt, cast of test-unseen: 100 % is above the ceiling, 0 %"]
+    above = cells.find_leaks([narrow, {**wide, "agent": "scan-matching", "success": [1] * 80}])
+    assert above == ["scan-matching, StopAt, cast of test-unseen: 100 % is above the ceiling, 0 %"]
 
 
 def test_who_does_the_same_in_every_kind_has_the_interval_of_one_kind():

@@ -29,7 +29,7 @@ pytestmark = pytest.mark.door
 TASK, DRIVEN = "Subterra/StopAtShort-v1", "Subterra/TraverseShort-v1"
 SHORT = "TraverseShort-v1"
 FEW = ("random", "fused")
-LONG = tuple(pytest.param(name, marks=pytest.mark.slow) for name in ("oracle", "ring-filter", "particle-filter"))
+LONG = tuple(pytest.param(name, marks=pytest.mark.slow) for name in ("oracle", "particle-filter"))
 MINE = """
 from flax import struct
 import jax.numpy as jnp
@@ -231,7 +231,7 @@ def test_board_and_recorder_drive_with_each_of_them(places):
         ("policy:nobody", TASK, PolicyError, r"nobody: no such policy; released are"),
         ("empty", TASK, PolicyError, r"empty: holds no policy.safetensors; release it again"),
         ("nobody", None, AgentError, r"no agent 'nobody'; there are random, .*; or policy:NAME"),
-        ("ring-filter", None, PolicyError, r"ring-filter: drives any task, so name one"),
+        ("scan-matching", None, PolicyError, r"scan-matching: drives any task, so name one"),
         (
             "TraverseShort-v1",
             TASK,

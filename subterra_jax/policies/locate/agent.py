@@ -4,6 +4,7 @@ One that has learnt to take a map gets the one of the task by `with_map`, and dr
 Round boxes it steers by the written avoidance: what is learnt is where the robot is.
 """
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
@@ -13,7 +14,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from subterra_jax.baselines.agent import Action, Known, Observed, n_ranges
 from subterra_jax.baselines.avoidance import steering_of
-from subterra_jax.baselines.navigator import Memory, Navigator, Pace
+from subterra_jax.baselines.navigator import Memory, Navigator
 from subterra_jax.baselines.steering import CentreLine
 from subterra_jax.policies.files import Conditions, PolicyError
 from subterra_jax.policies.locate.map_strip import MapStrip
@@ -71,5 +72,5 @@ class Locating(Trained):
         return self._navigator(params).act(key, memory, obs, params, known)
 
     def _navigator(self, params: EnvParams) -> Navigator:
-        pace = Pace() if self.speed is None else Pace(self.speed)
-        return Navigator(self.given.localiser(params), steering_of(params, CentreLine()), name=self.name, pace=pace)
+        cruise, steering = math.inf if self.speed is None else self.speed, steering_of(params, CentreLine())
+        return Navigator(self.given.localiser(params), steering, name=self.name, cruise=cruise)

@@ -1,1 +1,0 @@
-"""Counting the rings of the lining, without a map and without learning."""
