@@ -7,7 +7,7 @@ Brax up to 0.14.2 calls `jax.device_put_replicated`, which JAX 0.10 removed: its
 
 import contextlib
 import io
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jax
@@ -28,8 +28,6 @@ except ImportError as missing:
     raise MissingLibraryError(__name__, "brax", "brax") from missing
 
 _MISSED = "device_put_replicated"
-# From params to those of a batch and their `vmap` axes.
-Randomization = Callable[[EnvParams], tuple[EnvParams, Any]]
 
 
 class SubterraBraxEnv(Env):
@@ -149,44 +147,11 @@ class FreshResetWrapper(Wrapper):
         return stepped.replace(pipeline_state=pipeline_state, obs=obs, info=info)
 
 
-class RandomizedVmapWrapper(Wrapper):
-    """Batches environments that differ in their params, in place of Brax's `DomainRandomizationVmapWrapper`.
-
-    Brax's own steps the innermost environment and so leaves out every wrapper in between, `RescaleAction` among them.
-
-    Args:
-        env: One environment, or a wrapper around one.
-        randomization_fn: As for `wrap`.
-    """
-
-    def __init__(self, env: Env, randomization_fn: Randomization):
-        super().__init__(env)
-        self._batch, self._axes = randomization_fn(self.unwrapped.sys)
-
-    def reset(self, rng: jax.Array) -> State:
-        return self._with_own_params(self.env.reset, rng)
-
-    def step(self, state: State, action: jax.Array) -> State:
-        return self._with_own_params(self.env.step, state, action)
-
-    def _with_own_params(self, function: Callable[..., State], *arguments: Any) -> State:
-        inner = self.unwrapped
-
-        def call(params: EnvParams, *arguments: Any) -> State:
-            before, inner.sys = inner.sys, params
-            try:
-                return function(*arguments)
-            finally:
-                inner.sys = before
-
-        return jax.vmap(call, (self._axes, *(0 for _ in arguments)))(self._batch, *arguments)
-
-
 def wrap(
     env: SubterraBraxEnv,
     episode_length: int | None = None,
     action_repeat: int = 1,
-    randomization_fn: Randomization | None = None,
+    randomization_fn: None = None,
 ) -> Wrapper:
     """Wrap an environment as `brax.envs.training.wrap` does, with a fresh draw at each reset.
 
@@ -196,13 +161,15 @@ def wrap(
         env: One environment, or a wrapper around one.
         episode_length: Steps after which an episode is truncated; `None` is the task's horizon.
         action_repeat: Steps for which each action is held.
-        randomization_fn: Function of the params that returns those of a batch and their `vmap` axes, as
-            `subterra_jax.randomize` does. Brax's trainers bind its second argument, `rng`, to one key for each
-            environment.
+        randomization_fn: None, which Brax's trainers pass.
+
+    Raises:
+        ValueError: Params are to be randomised, which `subterra_jax.randomize` does for an `AutoReset`.
     """
+    if randomization_fn is not None:
+        raise ValueError("Brax's randomization leaves out wrappers: take subterra_jax.randomize with AutoReset")
     length = env.unwrapped.episode_length if episode_length is None else episode_length
-    many = VmapWrapper(env) if randomization_fn is None else RandomizedVmapWrapper(env, randomization_fn)
-    return FreshResetWrapper(EpisodeWrapper(many, length, action_repeat))
+    return FreshResetWrapper(EpisodeWrapper(VmapWrapper(env), length, action_repeat))
 
 
 @contextlib.contextmanager

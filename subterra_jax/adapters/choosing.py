@@ -22,21 +22,17 @@ class OptionError(SubterraError, ValueError):
     """An episode cannot begin as the options ask."""
 
 
-def read_choice(
-    env: TunnelEnv, params: EnvParams, options: Mapping[str, Any] | None, n_envs: int | None = None
-) -> Choice | None:
+def read_choice(env: TunnelEnv, params: EnvParams, options: Mapping[str, Any] | None) -> Choice | None:
     """Read the options of a reset.
 
     Args:
         env: The environment.
         params: Its params.
         options: `start`: a station (m), or a mapping with `station` (m), `lateral` (m to the left of the centreline)
-            and `heading` (rad against the centreline); `goal`: a station (m). Each may be an array `(n_envs,)` in a
-            batch; what is left out, or NaN, is drawn.
-        n_envs: Number of environments; `None` for a single one.
+            and `heading` (rad against the centreline); `goal`: a station (m). What is left out is drawn.
 
     Returns:
-        Numbers, or arrays `(n_envs,)`, float32; `None` where nothing is chosen.
+        Numbers, float32, NaN for what is drawn; `None` where nothing is chosen.
 
     Raises:
         OptionError: The task has no such thing, or a value is no number or outside of the tunnel.
@@ -54,7 +50,7 @@ def read_choice(
     wishes = {f"options['start']['{name}']": start.get(name) for name in _PLACE} | {
         "options['goal']": options.get("goal")
     }
-    station, lateral, heading, goal = (_numbers(name, wish, n_envs) for name, wish in wishes.items())
+    station, lateral, heading, goal = (_number(name, wish) for name, wish in wishes.items())
     length = float(np.min(np.asarray(params.tunnel.length)))
     _check_within("options['start']", station, 0.0, length)
     _check_within("a heading in options['start']", heading, -np.pi, np.pi, "rad")
@@ -88,29 +84,22 @@ def check_clear(clear: Any, choice: Choice) -> None:
     """Refuse a start in a wall or an obstacle.
 
     Raises:
-        OptionError: Naming the first environment's start.
+        OptionError: Naming the start.
     """
-    if not np.all(clear):
-        index = int(np.argmin(np.atleast_1d(clear)))
-        station, lateral = (np.atleast_1d(values)[index] for values in (choice.station, choice.lateral))
-        side = "" if np.isnan(lateral) else f", {lateral:g} m to the left of the centreline"
-        place = "the drawn station" if np.isnan(station) else f"{station:g} m"
+    if not clear:
+        side = "" if np.isnan(choice.lateral) else f", {choice.lateral:g} m to the left of the centreline"
+        place = "the drawn station" if np.isnan(choice.station) else f"{choice.station:g} m"
         raise OptionError(f"options['start']: at {place}{side} the robot would touch a wall or an obstacle")
 
 
-def _numbers(name: str, wish: Any, n_envs: int | None) -> np.ndarray:
-    """Return a wish as float32 numbers, `()` or `(n_envs,)`; NaN for none."""
-    shape = () if n_envs is None else (n_envs,)
+def _number(name: str, wish: Any) -> np.ndarray:
+    """Return a wish as one float32 number; NaN for none."""
     try:
-        values = np.asarray(np.nan if wish is None else wish, np.float32)
-        return np.broadcast_to(values, shape).copy()
+        return np.asarray(np.nan if wish is None else wish, np.float32).reshape(())
     except (TypeError, ValueError):
-        wanted = "one number" if n_envs is None else f"one number, or one for each of {n_envs} environments"
-        raise OptionError(f"{name} must be {wanted}, got {wish!r}") from None
+        raise OptionError(f"{name} must be one number, got {wish!r}") from None
 
 
-def _check_within(name: str, values: np.ndarray, low: float, high: float, unit: str = "m") -> None:
-    outside = ~np.isnan(values) & ~((values >= low - 1e-6) & (values <= high + 1e-6))
-    if outside.any():
-        wrong = np.atleast_1d(values)[np.atleast_1d(outside)][0]
-        raise OptionError(f"{name} must lie from {low:.2f} to {high:.2f} {unit} here, got {wrong:g}")
+def _check_within(name: str, value: np.ndarray, low: float, high: float, unit: str = "m") -> None:
+    if not np.isnan(value) and not low - 1e-6 <= value <= high + 1e-6:
+        raise OptionError(f"{name} must lie from {low:.2f} to {high:.2f} {unit} here, got {value:g}")

@@ -102,32 +102,13 @@ class Report(NamedTuple):
 
 
 def python_reader(example: Report) -> Callable[[np.ndarray], Report]:
-    """Return a reader of one step's words as Python's own floats, ints and bools; quicker than `unpacker`.
-
-    Args:
-        example: Shapes and dtypes of the report. Its leaves lie in the words as `pack` puts them: the observation, the
-            reward, the flags, and info in the order of its names.
-    """
-    n_obs = example.obs.shape[0]
-    scalars, arrays, at = [], [], 3
-    for name in sorted(example.info):
-        leaf = example.info[name]
-        if leaf.ndim:
-            arrays.append((name, leaf.dtype.kind, slice(at, at + leaf.size), leaf.shape))
-        else:
-            scalars.append((name, leaf.dtype.kind, at))
-        at += leaf.size
+    """Return a reader of one step's words as Python's own floats, ints and bools; `example` as for `unpacker`."""
+    unpack = unpacker(example)
 
     def read(words: np.ndarray) -> Report:
-        rest = words[n_obs:]
-        real, whole = rest.view(np.float32).tolist(), rest.view(np.int32).tolist()
-        info: dict[str, Any] = {
-            name: real[at] if kind == "f" else bool(whole[at]) if kind == "b" else whole[at]
-            for name, kind, at in scalars
-        }
-        for name, kind, where, shape in arrays:
-            info[name] = (rest[where] != 0 if kind == "b" else rest[where].view(f"{kind}4")).reshape(shape)
-        return Report(words[:n_obs].view(np.float32), real[0], bool(whole[1]), bool(whole[2]), info)
+        obs, reward, terminated, truncated, info = unpack(words)
+        plain = {name: values if values.ndim else values.item() for name, values in info.items()}
+        return Report(obs, reward.item(), terminated.item(), truncated.item(), plain)
 
     return read
 
@@ -137,10 +118,3 @@ def as_observation(vector: np.ndarray, fields: Fields | None) -> Observation:
     if fields is None:
         return vector
     return {name: vector[..., at].reshape(*vector.shape[:-1], *shape) for name, (at, shape) in fields.items()}
-
-
-def as_vector(observation: Observation) -> np.ndarray:
-    """Return the vector `(n_obs,)` of one observation; the inverse of `as_observation`."""
-    if isinstance(observation, dict):
-        return np.concatenate([values.ravel() for values in observation.values()])
-    return observation

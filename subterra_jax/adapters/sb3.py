@@ -1,6 +1,6 @@
 """Stable-Baselines3: a `VecEnv` over the batch, `PPO("MlpPolicy", SubterraVecEnv(256))`."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -9,31 +9,11 @@ from gymnasium.vector import AutoresetMode
 from subterra_jax.adapters.packing import Observation, as_observation
 from subterra_jax.adapters.vector import SubterraVectorEnv
 from subterra_jax.host.errors import MissingLibraryError
-from subterra_jax.state import State
 
 try:
     from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 except ImportError as missing:
     raise MissingLibraryError(__name__, "stable-baselines3") from missing
-
-
-class EnvRow:
-    """One environment of a batch: what it shares with the others, its `state`, and what a caller sets on it."""
-
-    def __init__(self, envs: SubterraVectorEnv, index: int):
-        self._envs, self._index = envs, index
-        self.unwrapped, self.spec, self.render_mode = self, envs.spec, envs.render_mode
-        self.observation_space, self.action_space = envs.single_observation_space, envs.single_action_space
-        self.env, self.params, self.task = envs.task_env, envs.task_params, envs.task_env.id
-
-    @property
-    def state(self) -> State | None:
-        """State on the host; `None` before the first reset."""
-        return self._envs.state_of(self._index)
-
-    def render(self) -> np.ndarray | None:
-        """Return a picture, `(480, 480, 3)` uint8; `None` without `rgb_array`."""
-        return None if self.render_mode is None else self._envs.picture(self._index)
 
 
 class SubterraVecEnv(VecEnv):
@@ -51,32 +31,16 @@ class SubterraVecEnv(VecEnv):
 
     def __init__(self, num_envs: int, task: str = "Subterra/Traverse-v1", flat: bool = False, **options: Any):
         self._envs = SubterraVectorEnv(num_envs, AutoresetMode.SAME_STEP, task, flat=flat, **options)
-        self._rows = [EnvRow(self._envs, index) for index in range(num_envs)]
         self._action = np.zeros((0,), np.float32)
         super().__init__(num_envs, self._envs.single_observation_space, self._envs.single_action_space)
         self.metadata["render_fps"] = self._envs.metadata["render_fps"]
 
     def reset(self) -> Observation:
-        """Begin an episode everywhere; seeds given by `seed` and options given by `set_options` are used once.
-
-        Raises:
-            OptionError: The task has no such thing, or a robot cannot stand there.
-        """
-        obs, _ = self._envs.reset(seed=list(self._seeds), options=self._gathered_options())
+        """Begin an episode everywhere; seeds given by `seed` are used once."""
+        obs, _ = self._envs.reset(seed=list(self._seeds))
         self.reset_infos = [{} for _ in range(self.num_envs)]
         self._reset_seeds()
-        self._reset_options()
         return obs
-
-    def _gathered_options(self) -> dict[str, Any]:
-        """Join the options of each environment: arrays in which NaN leaves what is drawn."""
-        names = {name for options in self._options for name in options}
-        gathered: dict[str, Any] = {name: [options.get(name, np.nan) for options in self._options] for name in names}
-        if "start" in gathered and any(isinstance(start, Mapping) for start in gathered["start"]):
-            starts = [start if isinstance(start, Mapping) else {"station": start} for start in gathered["start"]]
-            places = {name for start in starts for name in start}
-            gathered["start"] = {name: [start.get(name, np.nan) for start in starts] for name in places}
-        return gathered
 
     def step_async(self, actions: np.ndarray) -> None:
         """Keep the actions for `step_wait`."""
@@ -101,22 +65,18 @@ class SubterraVecEnv(VecEnv):
         """Return a picture of each environment."""
         return self._envs.render() or [None] * self.num_envs
 
-    def _chosen(self, indices: Any) -> list[EnvRow]:
-        return [self._rows[index] for index in self._get_indices(indices)]
-
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """Return an attribute of each environment: one of `EnvRow`, or one that was set before."""
-        return [getattr(row, attr_name) for row in self._chosen(indices)]
+        """Return an attribute of `SubterraVectorEnv`, which all environments share."""
+        return [getattr(self._envs, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Keep a value with each environment for `get_attr`; the simulator ignores it."""
-        for row in self._chosen(indices):
-            setattr(row, attr_name, value)
+        """Keep a value for `get_attr`; the simulator ignores it."""
+        setattr(self._envs, attr_name, value)
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
-        """Call a method of `EnvRow` for each environment."""
-        return [getattr(row, method_name)(*method_args, **method_kwargs) for row in self._chosen(indices)]
+        """Refuse: the environments of a batch have no methods of their own."""
+        raise AttributeError(f"an environment of a batch has no method {method_name!r}")
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
         """Return False for each environment: only the batch as a whole is wrapped."""
-        return [False for _ in self._chosen(indices)]
+        return [False for _ in self._get_indices(indices)]

@@ -1,6 +1,5 @@
 """Gymnasium, one environment: no GL, no GPU, a step in some 50 µs of one core."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,9 +21,8 @@ class SubterraEnv(Door, Env[Observation, np.ndarray]):
         task: Id of the task.
         flat: Return a plain vector for every task.
         render_mode: `None` or `rgb_array`.
-        view: Picture of `render`: `top`, the plan from above, drawn without GL; or `mujoco`, from a camera behind the
-            robot: the scene, or without one the bore of the tunnel.
-        scene: Folder of `scene.build`, or one of its MJCF files; its tunnel is driven where no `tunnel` is given.
+        view: Picture of `render`: `top`, the plan from above, drawn without GL; or `mujoco`, the bore of the tunnel
+            from a camera behind the robot.
         **options: As for `subterra_jax.make`: `tunnel`, `lining`, `split`, `sensor` and so on.
     """
 
@@ -38,10 +36,9 @@ class SubterraEnv(Door, Env[Observation, np.ndarray]):
         flat: bool = False,
         render_mode: str | None = None,
         view: str = "top",
-        scene: str | Path | None = None,
         **options: Any,
     ):
-        self._adopt(*open_task(task, flat, render_mode, view, scene, options), render_mode)
+        self._adopt(*open_task(task, flat, render_mode, view, options), render_mode)
 
     def _adopt(self, task: Task, view: View, render_mode: str | None) -> None:
         self.task, self.view, self.render_mode = task, view, render_mode
@@ -89,16 +86,6 @@ class SubterraEnv(Door, Env[Observation, np.ndarray]):
     def state(self) -> State | None:
         """Present state, on the host; `None` before the first reset."""
         return None if self._packed is None else self.task.unpack(np.asarray(self._packed))[1]
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Leave the device: another process may have another default one."""
-        return {**self.__dict__, "_packed": None if self._packed is None else self._words()}
-
-    def _words(self) -> np.ndarray:
-        return np.array(self._packed)
-
-    def _put(self, words: np.ndarray, obs: np.ndarray) -> None:
-        self._packed = words
 
     def render(self) -> np.ndarray | None:
         """Return a picture of the last step, `(height, width, 3)` uint8; `None` without `rgb_array`.

@@ -6,7 +6,6 @@ whatever its neighbours do. `AutoReset` shares one key and is quicker inside a g
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -17,7 +16,6 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from jaxtyping import Array, Bool, Float
 
-from subterra_jax.adapters.choosing import check_clear, read_choice, reset_chosen
 from subterra_jax.adapters.packing import (
     Fields,
     Observation,
@@ -28,7 +26,6 @@ from subterra_jax.adapters.packing import (
     take_key,
 )
 from subterra_jax.adapters.task import Door, open_task, refuse_fork
-from subterra_jax.rules import Choice
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel_env import TunnelEnv
 
@@ -85,7 +82,6 @@ class SubterraVectorEnv(Door, VectorEnv[Observation, np.ndarray, np.ndarray]):
         flat: As for `SubterraEnv`.
         render_mode: As for `SubterraEnv`; `render` returns one picture for each environment.
         view: As for `SubterraEnv`.
-        scene: As for `SubterraEnv`.
         **options: As for `SubterraEnv`.
     """
 
@@ -98,12 +94,11 @@ class SubterraVectorEnv(Door, VectorEnv[Observation, np.ndarray, np.ndarray]):
         flat: bool = False,
         render_mode: str | None = None,
         view: str = "top",
-        scene: str | Path | None = None,
         **options: Any,
     ):
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")
-        self.task, self.view = open_task(task, flat, render_mode, view, scene, options)
+        self.task, self.view = open_task(task, flat, render_mode, view, options)
         self.num_envs, self.render_mode = num_envs, render_mode
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": 10, "autoreset_mode": self.autoreset_mode}
@@ -121,26 +116,19 @@ class SubterraVectorEnv(Door, VectorEnv[Observation, np.ndarray, np.ndarray]):
         Args:
             seed: An int seeds environment i with seed + i; a sequence holds one seed for each. With `None` an
                 environment goes on with its stream.
-            options: `reset_mask`: a bool array `(num_envs,)`; the other environments stay as they are. `goal` and
-                `start` as for `SubterraEnv`, for these episodes alone; one number for all environments, or an array
-                `(num_envs,)` in which NaN leaves what is drawn.
+            options: `reset_mask`: a bool array `(num_envs,)`; the other environments stay as they are.
 
         Returns:
             Observations of all environments, and an empty info.
 
         Raises:
-            OptionError: The task has no such thing, or a robot cannot stand there; all environments stay as they were.
+            ValueError: There is another option, or the mask has another shape.
         """
         refuse_fork()
-        mask = self._reset_mask(options)
-        wishes = {name: wish for name, wish in (options or {}).items() if name != "reset_mask"}
-        env, params = self.task_env, self.task_params
-        choice = read_choice(env, params, wishes, self.num_envs)
+        mask = self._reset_mask(options or {})
         super().reset(seed=seed if isinstance(seed, int) else None)
         others = self._empty() if self._rows is None else self._rows
-        rows, clear = _reset(env, mask, self._streams(seed, mask), others, params, choice)
-        if choice is not None:
-            check_clear(clear, choice)
+        rows = _reset(self.task_env, mask, self._streams(seed, mask), others, self.task_params)
         self._rows, self._obs, self._pending = rows, np.array(rows.obs), self._pending & ~mask
         return as_observation(self._obs, self.task.fields), {}
 
@@ -179,45 +167,35 @@ class SubterraVectorEnv(Door, VectorEnv[Observation, np.ndarray, np.ndarray]):
         terminated, truncated = step.terminated & ~begun, step.truncated & ~begun
         done = terminated | truncated
         if mode == AutoresetMode.NEXT_STEP and begun.any():
-            rows, _ = _reset(env, begun, before.stream, rows, params)
+            rows = _reset(env, begun, before.stream, rows, params)
         elif mode == AutoresetMode.SAME_STEP and done.any():
-            rows, _ = _reset(env, done, rows.stream, rows, params)
+            rows = _reset(env, done, rows.stream, rows, params)
         if mode != AutoresetMode.SAME_STEP:
             self._pending = done
         self._rows, self._obs = rows, np.array(rows.obs)
         return as_observation(self._obs, self.task.fields), reward, terminated, truncated, step
 
-    def state_of(self, index: int) -> State | None:
-        """Return the state of one environment on the host; `None` before the first reset."""
-        return jax.tree.map(lambda leaf: np.asarray(leaf[index]), self._rows.state) if self._rows else None
-
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Return a picture of each environment, `(480, 480, 3)` uint8; `None` without `rgb_array`."""
-        return None if self.render_mode is None else tuple(self.picture(index) for index in range(self.num_envs))
-
-    def picture(self, index: int) -> np.ndarray:
-        """Return a picture of one environment, `(480, 480, 3)` uint8."""
-        obs = self._last("render")[index]
-        return self.view.picture(self.task_env, self.task_params, self.state_of(index), obs)
+        if self.render_mode is None:
+            return None
+        obs, states = self._last("render"), jax.device_get(self._rows.state if self._rows else None)
+        own = (jax.tree.map(lambda leaf, i=i: leaf[i], states) for i in range(self.num_envs))
+        return tuple(self.view.picture(self.task_env, self.task_params, *each) for each in zip(own, obs, strict=True))
 
     def close_extras(self, **kwargs: Any) -> None:
         """Release the renderer, if there is one."""
         self.view.close()
 
-    def _words(self) -> np.ndarray:
-        return np.asarray(_pack_rows(self._rows))
-
-    def _put(self, words: np.ndarray, obs: np.ndarray) -> None:
-        stream, state = self.task.unpack(words)
-        self._rows = jax.tree.map(jnp.asarray, Rows(stream, state, obs))
-
     def _empty(self) -> Rows:
         zeros = lambda leaf: jnp.zeros((self.num_envs, *leaf.shape), leaf.dtype)  # noqa: E731
         return jax.tree.map(zeros, Rows(jax.ShapeDtypeStruct((2,), np.uint32), self.task.state, self.task.report.obs))
 
-    def _reset_mask(self, options: dict[str, Any] | None) -> np.ndarray:
+    def _reset_mask(self, options: dict[str, Any]) -> np.ndarray:
         """Return the caller's mask, checked; all environments without one."""
-        mask = (options or {}).get("reset_mask")
+        if unknown := sorted(set(options) - {"reset_mask"}):
+            raise ValueError(f"no option {unknown[0]!r} in a reset of a batch; there is 'reset_mask'")
+        mask = options.get("reset_mask")
         if mask is None:
             return np.ones(self.num_envs, np.bool_)
         if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_:
@@ -241,38 +219,23 @@ class SubterraVectorEnv(Door, VectorEnv[Observation, np.ndarray, np.ndarray]):
 
 
 @partial(jax.jit, static_argnums=0)
-def _reset(
-    env: TunnelEnv, mask: Bool[Array, "n"], stream: Array, others: Rows, params: EnvParams, choice: Choice | None = None
-) -> tuple[Rows, Bool[Array, "n"] | None]:
+def _reset(env: TunnelEnv, mask: Bool[Array, "n"], stream: Array, others: Rows, params: EnvParams) -> Rows:
     """Reset the rows of a mask from their streams; take the other rows from `others`.
 
-    A reset costs a scan, and few environments finish in one step: so a few at a time are gathered and reset. With a
-    choice the second result tells which robots stand clear.
+    A reset costs a scan, and few environments finish in one step: so a few at a time are gathered and reset.
     """
     n_envs = mask.shape[0]
     n_few = max(1, n_envs // 32)
-    Carry = tuple[Array, Rows, Any]
 
-    def some(carry: Carry) -> Carry:
-        left, rows, clear = carry
+    def some(carry: tuple[Array, Rows]) -> tuple[Array, Rows]:
+        left, rows = carry
         (index,) = jnp.nonzero(left, size=n_few, fill_value=n_envs)
         key, after = jax.vmap(take_key)(jnp.take(stream, index, axis=0, mode="clip"))
-        if choice is None:
-            obs, state = jax.vmap(env.reset, (0, None))(key, params)
-        else:
-            own = Choice(*(jnp.take(jnp.asarray(values), index, mode="clip") for values in choice))
-            obs, state, stands = jax.vmap(partial(reset_chosen, env), (0, None, 0))(key, params, own)
-            clear = clear.at[index].set(stands, mode="drop")
+        obs, state = jax.vmap(env.reset, (0, None))(key, params)
         rows = jax.tree.map(lambda old, new: old.at[index].set(new, mode="drop"), rows, Rows(after, state, obs))
-        return left.at[index].set(False, mode="drop"), rows, clear
+        return left.at[index].set(False, mode="drop"), rows
 
-    clear = None if choice is None else jnp.ones(n_envs, bool)
-    return jax.lax.while_loop(lambda carry: jnp.any(carry[0]), some, (mask, others, clear))[1:]
-
-
-@jax.jit
-def _pack_rows(rows: Rows) -> Array:
-    return jax.vmap(pack)((rows.stream, rows.state))
+    return jax.lax.while_loop(lambda carry: jnp.any(carry[0]), some, (mask, others))[1]
 
 
 @partial(jax.jit, static_argnums=0)

@@ -1,36 +1,29 @@
-"""The pictures of `render`: the plan from above, or scene or bore through MuJoCo."""
+"""The pictures of `render`: the plan from above, or the bore through MuJoCo."""
 
 import functools
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, Protocol
 
 import jax
 import numpy as np
 
-from subterra_jax.host.errors import SubterraError
 from subterra_jax.lidar3d.beams import level_ring
 from subterra_jax.parts.boxes import Boxes
 from subterra_jax.parts.spatial_lidar import SENSORS
 from subterra_jax.pictures.camera import FollowCamera, TunnelChoice
 from subterra_jax.pictures.carrier import add_carrier
-from subterra_jax.pictures.renderer import import_mujoco
 from subterra_jax.pictures.top_down import top_down, wall_points
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tasks import TASKS, find, is_planar, tunnel_for
 from subterra_jax.tunnel import Tunnel
 from subterra_jax.tunnel.plan import TunnelPlan
-from subterra_jax.tunnel.sources import Source, load_tunnel, tunnel_of
+from subterra_jax.tunnel.sources import Source
 from subterra_jax.tunnel_env import TunnelEnv
 
 VIEWS = ("top", "mujoco")
 SIZE = 480
 _BEHIND, _PITCH_DEG, _AHEAD = 4.0, -14.0, 1.0  # of the robot's middle: m, degrees, m
 _BODY_HEIGHT = 0.55  # m above the ground, of the point that the camera follows
-
-
-class SceneError(SubterraError):
-    """A scene cannot be read or drawn."""
 
 
 class View(Protocol):
@@ -45,27 +38,24 @@ class View(Protocol):
         ...
 
 
-def make_view(view: str, scene: str | Path | None, choice: TunnelChoice | None = None) -> View:
+def make_view(view: str, choice: TunnelChoice | None = None) -> View:
     """Return a view by its name.
 
     Args:
         view: One of `VIEWS`.
-        scene: Scene to show; `None`: no scene.
-        choice: Tunnel to show without a scene; the packaged one if left out.
+        choice: Tunnel to show; the packaged one if left out.
 
     Raises:
         ValueError: The view does not exist.
         MissingLibraryError: MuJoCo is not installed.
-        SceneError: The scene cannot be read.
     """
     if view not in VIEWS:
         raise ValueError(f"view must be one of {VIEWS}, got {view!r}")
-    return TopView() if view == "top" else MujocoView(None if scene is None else Path(scene), choice)
+    return TopView() if view == "top" else MujocoView(choice or TunnelChoice())
 
 
 def view_for(
     view: str,
-    scene: str | Path | None,
     task: str,
     tunnel: Source | Sequence[Source],
     split: str | None,
@@ -74,10 +64,8 @@ def view_for(
 ) -> tuple[View, Any]:
     """Return the view of an environment that `subterra_jax.make` is to make, and its tunnel; errors as there."""
     known = TASKS.get(id := find(task))
-    if scene is not None and tunnel is None and split is None:
-        tunnel = tunnel_of(Path(scene))
     tunnel = tunnel_for(id, tunnel, split, spatial=not is_planar(sensor))
-    return make_view(view, scene, TunnelChoice(tunnel, lining, None if known is None else known.piece)), tunnel
+    return make_view(view, TunnelChoice(tunnel, lining, None if known is None else known.piece)), tunnel
 
 
 class TopView:
@@ -121,31 +109,13 @@ def _line_across(tunnel: Tunnel, station: float) -> np.ndarray:
 
 
 class MujocoView:
-    """The tunnel from a camera behind the robot, drawn by MuJoCo.
+    """The bore of the tunnel from a camera behind the robot, drawn by MuJoCo.
 
-    Of a scene it shows the scene itself. Without one it draws the bore of the tunnel's file or drawing; a tunnel
-    without a bore has upright walls below an assumed crown.
-
-    Args:
-        scene: Folder that `scene.build` wrote, or one of its MJCF files (`scene_furnished.xml`); `None`: no scene.
-        choice: Tunnel to draw without a scene.
+    A tunnel without a bore has upright walls below an assumed crown.
     """
 
-    def __init__(self, scene: Path | None, choice: TunnelChoice | None = None):
-        mujoco, self._choice, self._scene = import_mujoco("view='mujoco'"), choice or TunnelChoice(), scene
-        self._plan: TunnelPlan | None = None
-        model = None
-        if scene is not None:
-            path, tunnel = scene / "scene.xml" if scene.is_dir() else scene, tunnel_of(scene)
-            for needed in (path, tunnel):
-                if not needed.is_file():
-                    raise SceneError(f"{scene} is no scene folder: {needed} is missing")
-            try:
-                model = mujoco.MjModel.from_xml_path(str(path))
-            except ValueError as cause:
-                raise SceneError(f"{path} cannot be loaded: {cause}") from cause
-            self._plan = load_tunnel(tunnel)
-        self._camera = FollowCamera(self._choice, SIZE, SIZE, model)
+    def __init__(self, choice: TunnelChoice):
+        self._camera = FollowCamera(choice, SIZE, SIZE)
 
     def picture(self, env: TunnelEnv, params: EnvParams, state: State, obs: np.ndarray) -> np.ndarray:
         """See `View`; the observation is not used.
@@ -156,7 +126,7 @@ class MujocoView:
         """
         position, heading = np.asarray(state.position, np.float64), float(state.heading)
         facing = np.array([np.cos(heading), np.sin(heading), 0.0])
-        plan = self._plan if self._plan is not None else self._camera.follow(int(state.tunnel), position, facing)
+        plan = self._camera.follow(int(state.tunnel), position, facing)
         ground, slope = _ground(plan, position, facing)
         middle = ground + np.array([0.0, 0.0, _BODY_HEIGHT])
         body = (ground, heading, slope, float(params.vehicle.radius), plan.lidar_height)
@@ -168,10 +138,6 @@ class MujocoView:
             elevation=_PITCH_DEG,
             add=lambda scene: add_carrier(scene, *body),
         )
-
-    def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
-        """Open the scene anew in a copy or another process: neither module nor renderer can be copied."""
-        return type(self), (self._scene, self._choice)
 
     def close(self) -> None:
         self._camera.close()

@@ -7,7 +7,6 @@ import pytest
 from brax.envs import base
 from brax.envs.wrappers import training
 
-import subterra_jax as st
 from subterra_jax.adapters.brax import RescaleAction, SubterraBraxEnv, jax_for_brax, wrap
 
 pytestmark = pytest.mark.door
@@ -99,11 +98,6 @@ def test_actions_between_minus_and_plus_one_span_the_bounds(env, states):
     np.testing.assert_allclose(states.pipeline_state.command[1, 2], high, atol=1e-6)
 
 
-def randomized(params, rng):
-    """A `randomization_fn` as Brax's trainers call it: `rng` holds one raw key for each environment."""
-    return st.randomize(jax.random.wrap_key_data(rng[0]), params, {"lidar.range_sigma": (0.0, 0.1)}, len(rng))
-
-
 def test_what_a_wrapper_keeps_among_the_metrics_stays_there(env):
     """Brax's evaluation keeps the reward there; its trainers scan over steps, so no entry may come or go."""
     watched = training.EvalWrapper(wrap(RescaleAction(env)))
@@ -113,30 +107,9 @@ def test_what_a_wrapper_keeps_among_the_metrics_stays_there(env):
     assert jax.tree.structure(state) == jax.tree.structure(stepped)
 
 
-def test_each_environment_of_a_randomised_batch_has_its_own_params_and_no_wrapper_is_left_out(env):
-    class ShowSigma(RescaleAction):
-        def reset(self, rng):
-            return self.with_sigma(super().reset(rng))
-
-        def step(self, state, action):
-            return self.with_sigma(super().step(state, action))
-
-        def with_sigma(self, state):
-            return state.replace(metrics={**state.metrics, "sigma": self.unwrapped.sys.lidar.range_sigma})
-
-    before = env.params
-    wrapped = wrap(ShowSigma(env), LENGTH, randomization_fn=lambda params: randomized(params, KEYS))
-    stepped = jax.jit(wrapped.step)(jax.jit(wrapped.reset)(KEYS), ACTION)
-    np.testing.assert_array_equal(stepped.metrics["sigma"], randomized(before, KEYS)[0].lidar.range_sigma)
-    assert len(np.unique(stepped.metrics["sigma"])) == 4
-    low, high = env.action_bounds
-    np.testing.assert_allclose(stepped.pipeline_state.command[0], 0.5 * (low + high), atol=1e-6)
-    assert env.params is before, "the environment is left as it was"
-
-
-def test_braxs_own_randomisation_runs_on_the_bare_environment(env):
-    wrapped = training.wrap(env, LENGTH, randomization_fn=lambda params: randomized(params, KEYS))
-    assert jax.eval_shape(wrapped.step, jax.eval_shape(wrapped.reset, KEYS), ACTION).obs.shape == (4, 18)
+def test_a_randomisation_that_would_leave_out_wrappers_is_refused(env):
+    with pytest.raises(ValueError, match=r"subterra_jax\.randomize"):
+        wrap(env, randomization_fn=lambda params, rng: (params, None))
 
 
 def test_what_jax_no_longer_has_is_lent_for_the_block_alone():
@@ -181,7 +154,6 @@ def test_braxs_own_trainers_run_and_report_the_tasks_metrics(env, name):
             num_envs=4,
             num_eval_envs=4,
             normalize_observations=True,
-            randomization_fn=randomized,
             **settings,
         )
     assert metrics["eval/episode_reward_jerk"] < 0.0

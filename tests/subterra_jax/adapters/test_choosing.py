@@ -6,9 +6,7 @@ import pytest
 
 import subterra_jax as st
 from subterra_jax.adapters.choosing import OptionError, read_choice
-from subterra_jax.adapters.sb3 import SubterraVecEnv
 from subterra_jax.adapters.single import SubterraEnv
-from subterra_jax.adapters.vector import SubterraVectorEnv
 from subterra_jax.rules import Choice, GoalParams
 
 pytestmark = pytest.mark.door
@@ -23,11 +21,6 @@ AHEAD = np.array([1.0, 0.0], np.float32)
 @pytest.fixture(scope="module")
 def env():
     return SubterraEnv(STOP, **WORLD)
-
-
-@pytest.fixture(scope="module")
-def envs():
-    return SubterraVectorEnv(3, "Disabled", STOP, **WORLD)
 
 
 def test_goal_and_start_are_where_they_were_asked_for(env):
@@ -93,28 +86,6 @@ def test_a_rule_whose_state_depends_on_the_start_brings_it_along(task, field):
     assert float(getattr(state.goal, field)) == pytest.approx(17.0)
 
 
-def test_every_environment_of_a_batch_has_its_own(envs):
-    goals = np.array([15.0, np.nan, 45.0])
-    drawn, _ = envs.reset(seed=5)
-    kept = 10.0 + (drawn["goal"] - drawn["start"])[:, 0]  # as far from the chosen start as from the drawn one
-    obs, _ = envs.reset(seed=5, options={"goal": goals, "start": {"station": [0.0, 10.0, 30.0], "lateral": 0.0}})
-    np.testing.assert_allclose(obs["goal"][:, 0], np.where(np.isnan(goals), kept, goals), rtol=1e-5)
-    np.testing.assert_allclose([envs.state_of(k).station for k in range(3)], [0.0, 10.0, 30.0])
-    mask = np.array([False, True, False])
-    masked, _ = envs.reset(options={"goal": 33.0, "reset_mask": mask})
-    np.testing.assert_allclose(masked["goal"][:, 0], [15.0, 33.0, 45.0])
-
-
-def test_sb3_passes_the_options_of_each_environment_once():
-    vec = SubterraVecEnv(3, STOP, **WORLD)
-    vec.set_options([{"goal": 15.0, "start": 5.0}, {}, {"start": {"lateral": 0.25}, "goal": 45.0}])
-    goal = vec.reset()["goal"][:, 0]
-    assert goal[[0, 2]].tolist() == [15.0, 45.0]
-    assert float(vec.get_attr("state", 0)[0].station) == 5.0
-    assert float(vec.get_attr("state", 2)[0].lateral) == 0.25
-    assert (vec.reset()["goal"][:, 0] != goal)[[0, 2]].all()
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -134,25 +105,16 @@ def test_sb3_passes_the_options_of_each_environment_once():
 )
 def test_what_cannot_be_is_refused_in_one_sentence_and_nothing_changes(env, options, message):
     env.reset(seed=1)
-    before = env.get_state()
+    before = jax.tree.leaves(env.state)
     with pytest.raises(OptionError, match=message) as caught:
         env.reset(options=options)
     assert isinstance(caught.value, st.SubterraError)
     assert "\n" not in str(caught.value)
-    np.testing.assert_array_equal(env.get_state().words, before.words)
+    for leaf, was in zip(jax.tree.leaves(env.state), before, strict=True):
+        np.testing.assert_array_equal(leaf, was)
 
 
 @pytest.mark.parametrize("task", ["Subterra/TraverseShort-v1", RELOCALISE])
 def test_a_task_without_a_goal_says_so(task):
     with pytest.raises(OptionError, match=f"{task} has no goal to choose; its options may hold 'start' alone"):
         read_choice(*st.make(task, tunnel="control"), {"goal": 10.0})
-
-
-def test_a_batch_names_the_number_that_it_wants_and_the_start_that_is_wrong(envs):
-    envs.reset(seed=1)
-    before = envs.get_state()
-    with pytest.raises(OptionError, match="one number, or one for each of 3 environments"):
-        envs.reset(options={"goal": [10.0, 20.0]})
-    with pytest.raises(OptionError, match=r"at 20 m, 3 m to the left"):
-        envs.reset(options={"start": {"station": 20.0, "lateral": [0.0, 3.0, 0.0]}})
-    np.testing.assert_array_equal(envs.get_state().words, before.words)

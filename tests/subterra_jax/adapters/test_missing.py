@@ -24,8 +24,8 @@ def test_a_missing_library_is_named_with_the_command_that_installs_it(adapter, l
     assert isinstance(caught.value, ImportError)
 
 
-def test_a_view_without_mujoco_names_the_command_that_installs_it(tmp_path, monkeypatch):
+def test_a_view_without_mujoco_names_the_command_that_installs_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
     with pytest.raises(st.SubterraError, match=r"pip install mujoco$") as caught:
-        make_view("mujoco", tmp_path)
+        make_view("mujoco")
     assert isinstance(caught.value, ImportError)

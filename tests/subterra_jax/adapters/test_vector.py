@@ -101,6 +101,8 @@ def test_what_a_caller_gets_wrong_is_named():
         envs.reset(options={"reset_mask": [True, False, False]})
     with pytest.raises(ValueError, match=r"\(3,\) and a True"):
         envs.reset(options={"reset_mask": np.zeros(3, np.bool_)})
+    with pytest.raises(ValueError, match="no option 'goal' in a reset of a batch"):
+        envs.reset(options={"goal": 40.0})
     with pytest.raises(ValueError, match="3 environments, got 2"):
         envs.reset(seed=[1, 2])
     with pytest.raises(ValueError, match=r"\(3, 2\), got \(2, 2\)"):
