@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from subterra_jax.batch import AutoReset, rollout
     from subterra_jax.compiled import cache_programs
     from subterra_jax.env import Env
-    from subterra_jax.evaluation.localisability import localisability
     from subterra_jax.policies import load_policy
     from subterra_jax.randomization import LogUniform, randomize
     from subterra_jax.state import EnvParams, State
@@ -45,7 +44,6 @@ _HOMES = {
     "TunnelPlan": "tunnel.plan",
     "load_policy": "policies",
     "load_tunnel": "tunnel.sources",
-    "localisability": "evaluation.localisability",
     "make": "tasks",
     "randomize": "randomization",
     "rollout": "batch",

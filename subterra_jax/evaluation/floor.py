@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from subterra_jax.state import EnvParams
 
-STRETCH, FINE = 1.0, 0.5  # m over which a wandering error is taken to be constant: for a floor, beside scans
+STRETCH = 1.0  # m over which a wandering error is taken to be constant
 FLAG_SIGMA = 0.06  # m; the flag is raised within one step of 0.2 m
 _GOALS = 60
 _DRAWS = 4000
@@ -84,42 +84,6 @@ def way_back_variance(distance: Float[np.ndarray, " n"], params: EnvParams) -> F
             errors.drive(-1.0)
         found.append(errors.covariance[0, 0])
     return np.array(found)
-
-
-def filter_variance(
-    station: Float[np.ndarray, " n"],
-    information: Float[np.ndarray, " n"] | Float[np.ndarray, "n blur"],
-    params: EnvParams,
-    blurs: tuple[float, ...] = (),
-) -> Float[np.ndarray, " n"]:
-    """Compute the variance of the station that a perfect filter keeps on the way through a tunnel at full speed, m².
-
-    It has commands, odometry and the information of each scan; to the first order in the errors.
-
-    Args:
-        station: Stations, m, growing.
-        information: Information of one scan about the station there, 1/m²; with `blurs` a column for each of them.
-        params: A task with slip; its start and its errors of commands and odometry.
-        blurs: Standard deviations of the station for which the columns hold, m, growing. Each scan then answers a
-            filter as uncertain as this one is at that place, within their range.
-
-    Returns:
-        Variances; behind the start, that of the start.
-
-    Source: Tichavský et al. 1998, the recursion of the posterior Cramér–Rao bound, here of a linear system.
-    """
-    begin, start = float(params.start.station), float(params.start.station_sigma) ** 2
-    at = begin + FINE * np.arange(max(1, math.ceil((station[-1] - begin) / FINE)) + 1)
-    scans = FINE / _full_step(params)
-    columns = information.reshape(len(station), -1).T
-    errors, found = _Errors(params, FINE, start), [start]
-    for row in scans * np.stack([np.interp(at[1:], station, column) for column in columns], axis=-1):
-        variance = errors.drive(1.0)
-        told = row[0] if not blurs else np.interp(0.5 * np.log(max(variance, 1e-12)), np.log(blurs), row)
-        if told > 0.0:
-            errors.learn(np.eye(6)[0], 1.0 / told)
-        found.append(errors.covariance[0, 0])
-    return np.interp(station, at, found)
 
 
 def _full_step(params: EnvParams) -> float:

@@ -1,7 +1,7 @@
 """Floor of the axial drift: what the ranges of a drive could tell about the way, whatever program reads them.
 
 A beam's slope over the station is that of the best line through its ranges from stations about the true one
-(statistical linearisation, as `subterra_jax.evaluation.localisability`); what the line leaves over counts as noise.
+(statistical linearisation); what the line leaves over counts as noise.
 One sweep against a perfect map knows the station to the Cramér–Rao bound σ₁. A program without a map ties each view
 length ℓ of wall to the next, with every sweep that sees both: over a way d its drift is at least
 σ₁ · sqrt(2 / n) · sqrt(d / ℓ), with n sweeps to a view length.
@@ -19,7 +19,7 @@ from scene.survey.carrier import rotate
 from scene.survey.cast import Caster, draw_returns, noise_sigma
 from scene.survey.config import SensorErrors
 
-LEAST_SLOPE = 0.005  # 1, as in `localisability`
+LEAST_SLOPE = 0.005  # 1
 _BLUR = 0.05  # m, spread of the stations about the true one
 _PLACES = np.array([-1.6, -0.8, 0.0, 0.8, 1.6]) * _BLUR  # m; standard deviation 1.13 times the blur
 _SWEEPS = 12  # sweeps of a drive that are looked at
