@@ -1,13 +1,8 @@
 """Settings of a recording, their checks, and the task, tunnel and agent that they name."""
 
 import dataclasses
-import functools
-from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
-
-import numpy as np
-from jaxtyping import Float
 
 import subterra_jax as st
 from subterra_jax import policies
@@ -15,17 +10,13 @@ from subterra_jax.baselines.agent import Agent
 from subterra_jax.evaluation import listed_episodes
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.host.files import require_folder
-from subterra_jax.lidar3d import beams
 from subterra_jax.parts.spatial_lidar import SENSORS
-from subterra_jax.policies import PREFIX
 from subterra_jax.state import EnvParams
 from subterra_jax.tasks import TASKS, find, first_tunnel
 from subterra_jax.tunnel.plan import TunnelPlan
 from subterra_jax.tunnel_env import TunnelEnv
 
-CloudName = Literal["none", "vlp16", "os1"]
 SensorName = Literal["planar16", "spin16x64", "vlp16", "os1-64", "avia"]
-_BEAMS: dict[str, tuple[Callable[[int], np.ndarray], int]] = {"vlp16": (beams.vlp16, 16), "os1": (beams.os1, 64)}
 
 
 class RecorderError(SubterraError):
@@ -41,17 +32,13 @@ class RecorderConfig:
         task: Task id, as `Subterra/StopAt-v1` or `StopAt`.
         agent: Driver, as on the leaderboard: a baseline, `policy:NAME`, `policy:FILE`, `policy:RUN-FOLDER`,
             `module:Class` or `FILE.py:Class`.
-        policy: Policy that drives instead: a `.safetensors` file, a run folder, or the name of a released one.
         seed: Seed of everything random in the episode.
         episode: Record this one of the task's 500 listed episodes instead (from 0), as the leaderboard drives it.
         tunnel: Tunnel file or name; the first of those that the task has by itself if left out.
         lining: Variant of the walls; `pockets` if left out.
         sensor: The robot's own LiDAR: `planar16`, or `spin16x64`, `vlp16`, `os1-64`, `avia` in three dimensions, whose
             returns are recorded as `/points` in place of `/scan`.
-        scene: Built scene folder: its tunnel is driven, and clouds are taken in it.
-        cloud: LiDAR in three dimensions, which needs `scene`.
-        columns: Columns in a turn of that LiDAR.
-        every: Steps from one cloud to the next.
+        every: Steps from one `/points` to the next.
         beams: Beams of a further planar scan in `/scan_dense`; none if 0.
         imu: Record an IMU at 100 Hz.
         steps: Steps after which the recording ends if the episode has not; the task's horizon if left out.
@@ -61,15 +48,11 @@ class RecorderConfig:
     out: Path
     task: str = "Subterra/StopAt-v1"
     agent: str = "dead-reckoning"
-    policy: str | None = None
     seed: int = 0
     episode: int | None = None
     tunnel: str | None = None
     lining: str | None = None
     sensor: SensorName = "planar16"
-    scene: Path | None = None
-    cloud: CloudName = "none"
-    columns: int = 900
     every: int = 1
     beams: int = 0
     imu: bool = False
@@ -86,17 +69,6 @@ class RecorderConfig:
         """Folder of the truth."""
         return self.truth or self.out / "truth"
 
-    @functools.cached_property
-    def directions(self) -> Float[np.ndarray, "n 3"]:
-        """Beams of the LiDAR in three dimensions, unit vectors in its frame, column by column."""
-        make, _ = _BEAMS[self.cloud]
-        return make(self.columns)
-
-    @property
-    def n_rings(self) -> int:
-        """Rings of the LiDAR in three dimensions."""
-        return _BEAMS[self.cloud][1]
-
 
 def check_config(config: RecorderConfig) -> RecorderConfig:
     """Check the numbers and folders of a config; return it unchanged.
@@ -105,7 +77,7 @@ def check_config(config: RecorderConfig) -> RecorderConfig:
         RecorderError: A number is out of range, two settings exclude each other, or a folder exists already.
         OutputError: A folder cannot be written.
     """
-    least = {"columns": 8, "every": 1, "beams": 0, "seed": 0}
+    least = {"every": 1, "beams": 0, "seed": 0}
     if config.steps is not None:
         least["steps"] = 1
     if config.episode is not None:
@@ -115,17 +87,8 @@ def check_config(config: RecorderConfig) -> RecorderConfig:
             raise RecorderError(f"{name} must be at least {value}, got {getattr(config, name)}")
     if config.seed >= 2**32:
         raise RecorderError(f"seed must be below 2**32, got {config.seed}")
-    if config.cloud not in ("none", *_BEAMS):
-        raise RecorderError(f"no LiDAR {config.cloud!r}; there are {', '.join(_BEAMS)}")
-    if config.cloud != "none" and config.scene is None:
-        raise RecorderError(f"cloud {config.cloud!r} needs a scene folder (`python -m scene.build` makes one)")
-    if config.sensor != SENSORS[0]:
-        if config.cloud != "none":
-            raise RecorderError(f"the sensor {config.sensor!r} fills /points itself: leave out the cloud")
-        if config.beams:
-            raise RecorderError(f"beams belong to the planar LiDAR, and the sensor is {config.sensor!r}")
-    if config.scene is not None and config.tunnel is not None:
-        raise RecorderError("either scene or tunnel, not both: a scene brings its own tunnel")
+    if config.sensor != SENSORS[0] and config.beams:
+        raise RecorderError(f"beams belong to the planar LiDAR, and the sensor is {config.sensor!r}")
     for folder in (config.recording_folder, config.truth_folder):
         if folder.exists():
             raise RecorderError(f"{folder}: exists already; recordings are not overwritten")
@@ -162,22 +125,18 @@ def open_world(config: RecorderConfig) -> World:
     """Make the task and read the tunnel of a recording.
 
     Raises:
-        RecorderError: The task does not exist, the tunnel is too short for it, or the cloud would miss part of it.
+        RecorderError: The task does not exist, or the tunnel is too short for it.
         TunnelError: The tunnel is missing or wrong.
     """
     name = find(config.task, short=True)
     if name not in TASKS:
         raise RecorderError(f"{name} cannot be recorded: the recorder drives robots on wheels")
     spatial = config.sensor != SENSORS[0]
-    source = config.tunnel or first_tunnel(name, spatial) if config.scene is None else config.scene / "tunnel.npz"
-    plan = st.load_tunnel(source, solid=spatial)
+    plan = st.load_tunnel(config.tunnel or first_tunnel(name, spatial), solid=spatial)
     try:
         env, params = st.make(name, plan, config.lining, sensor=config.sensor)
     except ValueError as error:
         raise RecorderError(str(error)) from error
-    unseen = [part for part in ("obstacles", "faults") if part in params.parts]
-    if unseen and config.cloud != "none":
-        raise RecorderError(f"the {config.cloud} sees none of the {unseen[0]} of {name}: leave out the cloud")
     piece = TASKS[name].piece
     if piece is not None:
         plan = plan.slice(piece[0], min(piece[1], plan.length - piece[0]))
@@ -188,10 +147,9 @@ def open_agent(config: RecorderConfig, world: World) -> Agent:
     """Make the agent of a recording.
 
     Raises:
-        SubterraError: The agent or policy does not exist, or the policy does not fit the task.
+        SubterraError: The agent does not exist, or does not fit the task.
     """
-    source = config.agent if config.policy is None else PREFIX + config.policy
-    return policies.open_agent(source, dataclasses.replace(world.env, estimates=True), world.params)
+    return policies.open_agent(config.agent, dataclasses.replace(world.env, estimates=True), world.params)
 
 
 def draw_episode(config: RecorderConfig, world: World) -> tuple[int, int | None]:

@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Float
 
 from subterra_jax.evaluation.episodes import SHA256
-from subterra_jax.lidar3d import Relief
 from subterra_jax.recorder import messages
 from subterra_jax.recorder.config import (
     RecorderConfig,
@@ -27,13 +26,10 @@ from subterra_jax.recorder.config import (
 )
 from subterra_jax.recorder.messages import Message, write_bag
 from subterra_jax.recorder.sensors import (
-    CLOUD_RANGE,
-    CLOUD_SIGMA,
     IMU_RATE,
     Inertial,
     Poses,
     axis_rows,
-    clouds,
     dense_scans,
     measure_imu,
     reckoned_poses,
@@ -93,18 +89,6 @@ def _points(trace: Trace, scans: Float[np.ndarray, "rows m"], sensor: Any, every
         yield Message(time, "/points", messages.point_cloud(time, beams[hit] * ranges[hit, None], ring[hit]))
 
 
-def _clouds(
-    relief: Relief, poses: Poses, station: Float[np.ndarray, " n"], config: RecorderConfig, seed: int
-) -> Iterator[Message]:
-    some = slice(None, None, config.every)
-    taken = Poses(poses.time[some], poses.position[some], poses.rotation[some])
-    beams = config.directions
-    ring = np.arange(len(beams)) % config.n_rings
-    for time, ranges in zip(taken.time, clouds(relief, taken, station[some], beams, seed), strict=True):
-        hit = np.isfinite(ranges)
-        yield Message(time, "/points", messages.point_cloud(time, beams[hit] * ranges[hit, None], ring[hit]))
-
-
 _RECORDING_SCHEMA, _TRUTH_SCHEMA = "subterra.recording/1", "subterra.recording-truth/1"
 _LIBRARIES = ("subterra-jax", "jax", "numpy", "rosbags")
 
@@ -119,9 +103,6 @@ def _recording_facts(config: RecorderConfig, trace: Trace, world: World, topics:
         sensors |= {"sensor": config.sensor, "every": config.every, "cloud_range": float(params.lidar.range_max)}
     if config.beams:
         sensors["scan_dense_beams"] = config.beams
-    if config.cloud != "none":
-        sensors |= {"cloud": config.cloud, "columns": config.columns, "every": config.every}
-        sensors |= {"cloud_range": CLOUD_RANGE, "cloud_sigma": CLOUD_SIGMA}
     if config.imu:
         sensors["imu_rate"] = IMU_RATE
     return {
@@ -130,7 +111,7 @@ def _recording_facts(config: RecorderConfig, trace: Trace, world: World, topics:
         "tunnel": plan.name,
         "provenance": plan.provenance,
         "lining": config.lining or plan.default_lining,
-        "agent": config.policy or config.agent,
+        "agent": config.agent,
         "observed": first,
         "steps": len(trace.command),
         "period": trace.period,
@@ -194,31 +175,28 @@ def record(config: RecorderConfig) -> Trace:
 
     Raises:
         RecorderError: The settings are wrong, or a folder exists or cannot be written.
-        SubterraError: Tunnel, scene, agent or policy are missing or wrong.
+        SubterraError: Tunnel or agent are missing or wrong.
     """
     config = check_config(config)
     messages.store()
     world = open_world(config)
     agent = open_agent(config, world)
-    relief = None if config.cloud == "none" else Relief.from_scene(config.scene or "", config.lining or "pockets")
     seed, severity = draw_episode(config, world)
     trace = drive(world.env, world.params, agent, seed, severity, config.steps)
     with ExitStack() as stack:
         recording, truth = (stack.enter_context(_new_folder(f)) for f in (config.recording_folder, config.truth_folder))
-        _write_recording(recording, config, trace, world, relief, seed)
+        _write_recording(recording, config, trace, world, seed)
         _write_truth(truth, recording, config, trace, world, _outcome(trace, seed, severity))
     return trace
 
 
-def _write_recording(
-    folder: Path, config: RecorderConfig, trace: Trace, world: World, relief: Relief | None, seed: int
-) -> None:
+def _write_recording(folder: Path, config: RecorderConfig, trace: Trace, world: World, seed: int) -> None:
     """Write the messages and facts that the robot itself knows."""
     parts, range_max = world.env.fields(world.params), float(world.params.lidar.range_max)
     height = world.sensor_height
     reckoned = reckoned_poses(trace, trace.observation[:, parts["odometry"]])
     sensor = true_poses(trace, world.plan).lift(height)
-    mounted = {"laser": not world.is_spatial, "lidar": world.is_spatial or relief is not None, "imu": config.imu}
+    mounted = {"laser": not world.is_spatial, "lidar": world.is_spatial, "imu": config.imu}
     streams: list[Iterator[Message]] = [
         _mounts(height, tuple(frame for frame, there in mounted.items() if there)),
         _frames(reckoned, "odom"),
@@ -234,8 +212,6 @@ def _write_recording(
         streams.append(_scans("/scan_dense", trace, dense, range_max))
     if config.imu:
         streams.append(_imu(measure_imu(sensor, seed)))
-    if relief is not None:
-        streams.append(_clouds(relief, sensor, np.asarray(trace.state.station), config, seed))
     topics = write_bag(folder, _merge(streams))
     _save_tum(folder / "odometry.tum", reckoned.lift(height))
     _write_facts(folder, _recording_facts(config, trace, world, topics))

@@ -6,8 +6,6 @@ left, z square to the track; `odom` is `base_link` at the start. Both LiDARs and
 
 import dataclasses
 import functools
-from collections.abc import Iterator
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,8 +14,6 @@ from jaxtyping import Array, Float
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from subterra_jax import lidar3d
-from subterra_jax.lidar3d import Relief
 from subterra_jax.recorder.trace import Trace, reckon
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel.plan import TunnelPlan
@@ -131,10 +127,7 @@ def measure_imu(poses: Poses, seed: int, noise: float = 1.0) -> Inertial:
     return Inertial(time, gyro, accel)
 
 
-CLOUD_RANGE = 100.0  # m
-CLOUD_SIGMA = 0.01  # m. Source: VLP-16 user manual, "up to ±3 cm (typical)", taken as three standard deviations
 _SCANS = 128  # planar scans in one batch
-_RAYS = 200_000  # rays of clouds in one batch
 _DENSE_STREAM = 0x5CA7  # a separate key: the episode's draws stay as they are
 
 
@@ -170,36 +163,3 @@ def _perceive(env: TunnelEnv, state: State, key: Array, index: Array, params: En
         return env.observe(state, noise, params)[env.fields(params)["ranges"]]
 
     return jax.vmap(one)(state, index)
-
-
-def clouds(
-    relief: Relief, poses: Poses, station: Float[np.ndarray, " n"], directions: Float[np.ndarray, "m 3"], seed: int
-) -> Iterator[Float[np.ndarray, " m"]]:
-    """Yield the noisy ranges of each sweep, m; NaN for a beam that meets nothing within `CLOUD_RANGE`.
-
-    A sweep is taken at one instant: the robot's motion during a turn of the head is not simulated.
-
-    Args:
-        relief: The bore's surface.
-        poses: Poses of the LiDAR in the tunnel frame.
-        station: Stations of the LiDAR, m.
-        directions: Beams of the LiDAR.
-        seed: Seed of the noise; sweep k depends on the seed and k alone.
-    """
-    size = max(1, min(len(poses), _RAYS // len(directions)))
-    beams = jnp.asarray(directions, jnp.float32)
-    quaternion = poses.rotation.as_quat()[:, [3, 0, 1, 2]]
-    for first in range(0, len(poses), size):
-        # The last batch is filled up, so that all have one shape.
-        rows = np.minimum(np.arange(first, first + size), len(poses) - 1)
-        there = (np.asarray(values[rows], np.float32) for values in (poses.position, quaternion, station))
-        ranges = np.asarray(_cast()(relief, *there, beams, CLOUD_RANGE))
-        for k in range(first, min(first + size, len(poses))):
-            noise = np.random.default_rng([seed, k]).normal(0.0, CLOUD_SIGMA, len(directions))
-            exact = ranges[k - first]
-            yield np.where(exact < CLOUD_RANGE, exact + noise, np.nan).astype(np.float32)
-
-
-@functools.cache
-def _cast() -> Any:
-    return jax.jit(jax.vmap(lidar3d.scan, in_axes=(None, 0, 0, 0, None, None)))

@@ -135,15 +135,12 @@ def test_the_same_config_gives_the_same_bytes(config, trace, tmp_path):
     [
         (("--task", "Fly"), "error: no task 'Fly'; there are"),
         (("--agent", "nobody"), "error: no agent 'nobody'; there are random"),
-        (("--policy", "nothing"), "error: nothing: no such policy"),
+        (("--agent", "policy:nothing"), "error: nothing: no such policy"),
         (("--episode", "500"), "error: episodes must be 1 to 500, got 501"),
         (("--steps", "0"), "error: steps must be at least 1, got 0"),
         (("--seed", "-1"), "error: seed must be at least 0, got -1"),
-        (("--cloud", "vlp16"), "error: cloud 'vlp16' needs a scene folder"),
         (("--tunnel", "no.npz"), "error: no.npz: no such tunnel file"),
         (("--lining", "velvet"), "error: tunnel 'open:train:0' has no lining 'velvet'"),
-        (("--scene", "nowhere", "--tunnel", "control"), "error: either scene or tunnel, not both"),
-        (("--scene", "nowhere"), "error: nowhere/tunnel.npz: no such tunnel file"),
     ],
 )
 def test_what_cannot_be_had_is_one_sentence_and_leaves_nothing(capsys, tmp_path, arguments, sentence):
