@@ -13,6 +13,7 @@ import numpy as np
 
 from subterra_jax import constants as c
 from subterra_jax.adapters import register_tasks
+from subterra_jax.compiled import keep_programs
 from subterra_jax.digest import digest, task_figures
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.host.loading import load_module
@@ -180,13 +181,15 @@ def make(
             `obstacles`, `faults` and `imu` bring their part to a task that lacks it.
 
     Returns:
-        The static environment (a `TunnelEnv`), and params whose every leaf is an array (`EnvParams`).
+        The static environment (a `TunnelEnv`), and params whose every leaf is an array (`EnvParams`). Compiled programs
+        are kept on disk from here on, see `cache_programs`.
 
     Raises:
         ValueError: No such task, no such entry, parts that do not go together, or a value that the simulator cannot
             honour.
         TunnelError: The tunnel file is unreadable or wrong, or has no such lining.
     """
+    keep_programs()
     id = find(id)
     if id in TASKS:
         tunnel = tunnel_for(id, tunnel, split, spatial=not is_planar(sensor))

@@ -50,7 +50,7 @@ class TunnelEnv:
     motion: Motion = dataclasses.field(default_factory=Unicycle)
     estimates: bool = False
 
-    @compiled()
+    @compiled(in_haste=True)
     def reset(self, key: PRNGKeyArray, params: EnvParams) -> tuple[Float[Array, n_obs], State]:
         """Begin an episode.
 
@@ -65,7 +65,7 @@ class TunnelEnv:
         state = self.begin(self.draw_reset(start_key, (), params), params)
         return self.observe(state, self.draw_step(scan_key, (), params), params), state
 
-    @compiled()
+    @compiled(in_haste=True)
     def step(
         self, key: PRNGKeyArray, state: State, action: Float[Array, n_action], params: EnvParams
     ) -> tuple[Float[Array, n_obs], State, Float[Array, ""], Bool[Array, ""], Bool[Array, ""], Info]:

@@ -14,7 +14,6 @@ from typing import Annotated, Literal
 import jax
 import tyro
 
-from subterra_jax.compiled import cache_programs
 from subterra_jax.host.command import EXIT_INTERRUPTED, parse, run_command
 from train import clock, devices
 from train.config import ConfigError, Legs, TrainConfig, check, make_config
@@ -110,7 +109,6 @@ def command(arguments: Command) -> int:
     if arguments.evaluation_episodes:
         check_episodes(arguments.evaluation_episodes, "evaluation_episodes")
     check_seeds(arguments.seeds)
-    cache_programs()
     clock.lap("import")
     world = with_reward(_world(arguments), reward_of(arguments))
     clock.lap("tunnel")

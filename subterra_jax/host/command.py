@@ -6,6 +6,7 @@ itself and names the other groups, which `--help-all` shows as well.
 
 import importlib.util
 import io
+import os
 import re
 import shutil
 import sys
@@ -17,7 +18,7 @@ from typing import TypeVar
 
 from subterra_jax.host.errors import SubterraError
 
-EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
+EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_UNREAD = 1, 2, 130, 141
 INPUT_ERRORS = (SubterraError, ValueError, OSError)  # for commands whose settings are checked by libraries, too
 _MAIN_GROUPS = ("options", "positional arguments", "subcommands")
 _RULE = re.compile(r" *-{5,}$")  # the line below a group's title
@@ -49,7 +50,8 @@ def parse(read: Callable[[list[str]], T], words: list[str] | None = None, groups
         if ended.code:
             print(f"error: {complaint_sentence(complaint.getvalue())}", file=sys.stderr)
         else:
-            print(page.getvalue().rstrip() if "--help-all" in words else _short_help(page.getvalue(), groups))
+            text = page.getvalue().rstrip() if "--help-all" in words else _short_help(page.getvalue(), groups)
+            sys.exit(run_command(lambda: print(text)))
         raise
 
 
@@ -70,13 +72,18 @@ def run_command(
 
     Returns:
         The command's own status; after a mistake, which is printed as one sentence on stderr, the `exit_status` of the
-        error, or 2; 130 after Ctrl-C.
+        error, or 2; 130 after Ctrl-C; 141 where nobody reads on, as behind `| head`.
     """
     try:
         with warnings.catch_warnings():
             if not sys.warnoptions:
                 warnings.simplefilter("ignore")
-            return act() or 0
+            status = act() or 0
+        sys.stdout.flush()  # or a pipe that nobody reads shows as Python ends, by a traceback
+        return status
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return EXIT_UNREAD
     except mistakes as error:
         print(f"error: {error_sentence(error)}", file=sys.stderr)
         return getattr(error, "exit_status", EXIT_BAD_INPUT)
