@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from subterra_jax.host.command import EXIT_BAD_INPUT, parse
+from subterra_jax.host.command import EXIT_BAD_INPUT, parse, run_command
 from subterra_jax.host.versions import VERSION
 
 # Name: module that it runs, and its meaning. The modules outside this package come with a checkout.
@@ -40,8 +40,7 @@ def main(words: Sequence[str] | None = None) -> int:
     if not module:
         from subterra_jax.tasks import list_tasks
 
-        print("\n".join(list_tasks()))
-        return 0
+        return run_command(lambda: print("\n".join(list_tasks())))
     root = Path(__file__).resolve().parents[1]
     path = root.joinpath(*module.split("."))
     if not path.with_suffix(".py").is_file() and not path.is_dir():

@@ -76,9 +76,9 @@ def cache_programs(folder: str | Path | None = None) -> Path:
     """Keep compiled programs on disk, so that the next process need not compile them again.
 
     This switches JAX's persistent cache on, for all programs of this process that take 0.1 s or more to compile.
-    `make` does so too, unless JAX has a folder already or `JAX_ENABLE_COMPILATION_CACHE=false` forbids it; importing the
-    package does not. The folder may be deleted at any time, and nothing limits its size: the programs of one task take
-    about 1 MB.
+    `make` does so too, unless JAX has a folder already or `JAX_ENABLE_COMPILATION_CACHE=false` forbids it. Importing
+    the package does not. The folder may be deleted at any time, and nothing limits its size: the programs of one task
+    take about 1 MB.
 
     Args:
         folder: Folder to keep them in. None is `JAX_COMPILATION_CACHE_DIR` if it is set, else a folder for this kind of

@@ -17,13 +17,25 @@ from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
 
+_CACHE_NAME = "subterra-compiled-"
+
+
+def _remove_forgotten() -> None:
+    """Removes the compiled programs of runs that were killed: their process is gone."""
+    for folder in Path(tempfile.gettempdir()).glob(f"{_CACHE_NAME}*-*"):
+        owner = folder.name.removeprefix(_CACHE_NAME).partition("-")[0]
+        if owner.isdecimal() and not Path("/proc", owner).exists() and Path("/proc/self").exists():
+            shutil.rmtree(folder, ignore_errors=True)
+
+
 # Before jax is imported: XLA reads its flags once, and what a test starts inherits them.
 # A flag that an XLA does not know ends the process: the emitters can be left out of jax 0.10 and no longer of 0.12.
 _EMITTERS = "--xla_cpu_use_fusion_emitters=false " if version("jax").startswith("0.10.") else ""
 os.environ.setdefault("XLA_FLAGS", f"{_EMITTERS}--xla_backend_optimization_level=0")
 _OWN_CACHE = None
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # the first process of a run; its workers find it set
-    _OWN_CACHE = os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="subterra-compiled-")
+    _remove_forgotten()
+    _OWN_CACHE = os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix=f"{_CACHE_NAME}{os.getpid()}-")
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 
 import jax  # noqa: E402

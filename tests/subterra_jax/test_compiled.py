@@ -237,13 +237,13 @@ def test_gymnasium_traces_and_compiles_an_environment_once(short, monkeypatch):
     assert [other.step(np.float32([0.0, 0.0]))[3] for _ in range(3)] == [False, False, True]
 
 
-def test_programs_are_kept_on_disk_only_where_it_is_asked_for(tmp_path: Path):
+def test_programs_are_kept_on_disk_from_the_first_make_on_and_not_by_the_import(tmp_path: Path):
     code = (
         "import sys, jax, jax.numpy as jnp, subterra_jax as st\n"
         "before = jax.config.jax_compilation_cache_dir\n"
         "jax.jit(lambda x: x + 1)(1)\n"
-        "print(before, st.cache_programs())\n"
-        "env, params = st.make('Subterra/TraverseShort-v1')\n"
+        "env, params = st.make('Subterra/TraverseShort-v1', tunnel='control')\n"
+        "print(before, jax.config.jax_compilation_cache_dir, st.cache_programs())\n"
         "env.reset(jax.random.key(0), params)"
     )
     places = {"XDG_CACHE_HOME": str(tmp_path), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
@@ -251,13 +251,28 @@ def test_programs_are_kept_on_disk_only_where_it_is_asked_for(tmp_path: Path):
     done = subprocess.run(
         [sys.executable, "-c", code], env={**clean, **places}, capture_output=True, text=True, check=True
     )
-    before, folder = done.stdout.split()
-    assert before == "None"
+    before, folder, same = done.stdout.split()
+    assert (before, same) == ("None", folder)
     assert Path(folder).is_relative_to(tmp_path / "subterra" / "compiled")
     assert list(Path(folder).iterdir())
+    forbidden = {**clean, **places, "JAX_ENABLE_COMPILATION_CACHE": "false"}
+    code = code.replace(", st.cache_programs()", "")
+    done = subprocess.run([sys.executable, "-c", code], env=forbidden, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["None", "None"]
 
 
 def test_a_folder_that_cannot_be_written_is_refused(tmp_path: Path):
     (tmp_path / "file").write_text("")
     with pytest.raises(st.SubterraError, match="cannot be written"):
         st.cache_programs(tmp_path / "file" / "x")
+
+
+def test_a_step_by_hand_is_that_of_a_compiled_function_and_may_be_part_of_one():
+    """By hand it is compiled in haste, which is no option of a program inside of another."""
+    env, params = st.make("Subterra/TraverseShort-v1", tunnel="control")
+    key = jax.random.key(0)
+    obs, state = env.reset(key, params)
+    inside = jax.jit(lambda: env.reset(jax.random.key(0), params))()
+    np.testing.assert_allclose(inside[0], obs, atol=1e-4)
+    args = key, state, jnp.array([1.0, 0.1]), params
+    np.testing.assert_allclose(jax.jit(env.step)(*args)[0], env.step(*args)[0], atol=1e-4)

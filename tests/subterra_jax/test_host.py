@@ -133,6 +133,16 @@ def test_a_mistake_or_an_interrupt_is_one_sentence_and_a_status(capsys, error, s
     assert capsys.readouterr().err == sentence
 
 
+@pytest.mark.parametrize("words", [["--help"], ["tasks"]])
+def test_a_reader_that_leaves_early_is_no_error(words):
+    """As `| head` does, once it has what it wants."""
+    command = [sys.executable, "-m", "subterra_jax", *words]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    process.stdout.close()
+    assert process.stderr.read() == b""
+    assert process.wait() == 141
+
+
 def test_an_error_of_the_program_keeps_its_traceback():
     with pytest.raises(ValueError, match="a fault"):
         run_command(fail(ValueError("a fault")))
