@@ -1,15 +1,20 @@
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from rich.console import Console
 
 from scene.bore import POCKET, STATION_STEP, Bore
+from scene.build import build
+from scene.config import BuildConfig
 from scene.fitting.assemble import measure_extents
 from scene.geometry import N_ANGLES, axis_through, section_angles
-from scene.writing.folder import write_geometry
+from scene.survey.config import SurveyConfig
+from scene.survey.simulate import simulate
+from scene.writing.folder import Reconstruction, write_geometry
 from scene.writing.furnished import FurnitureConfig
 from scene.writing.mjcf import SceneConfig
 from scene.writing.track import Track, TrackConfig, lay_track
@@ -66,3 +71,24 @@ def bore_file(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("cloud") / "bore.ply"
     trimesh.PointCloud(curved_d_bore(length=24, per_metre=2000, offset=(12.0, -3.0, 2.0)).points).export(path)
     return path
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """A simulated survey of sizes as built, and the scene that was built from it with its true poses."""
+
+    survey: Path
+    scene: Path
+    found: Reconstruction
+    truth: dict
+
+
+@pytest.fixture(scope="session")
+def simulated(tmp_path_factory) -> Simulated:
+    folder = tmp_path_factory.mktemp("simulated")
+    survey, scene = folder / "survey", folder / "scene"
+    config = SurveyConfig(survey, truth="metro", length=19.0, seed=601, tolerances=True, speed=2.0)
+    simulate(config, Console(quiet=True))
+    named = BuildConfig(provenance="simulated")
+    found = build(survey / "survey.bag", scene, survey / "groundtruth.tum", named)
+    return Simulated(survey, scene, found, json.loads((survey / "truth.json").read_text()))

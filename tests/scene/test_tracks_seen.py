@@ -6,20 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from scene.bore import Bore
-from scene.build import reconstruct
 from scene.cloud import Cloud
-from scene.config import ReconstructConfig
 from scene.fitting import rails as rails_seen
 from scene.fitting.rails import measure_again
 from scene.fitting.trackseen import SeenTrack, above_floor, find_track
 from scene.judging.sanity import doubt_track
-from scene.progress import Stages
-from scene.survey.config import SurveyConfig
-from scene.survey.simulate import simulate
-from scene.writing.folder import Reconstruction, write_geometry
+from scene.writing.folder import write_geometry
 from scene.writing.mjcf import SceneConfig
 from scene.writing.track import TrackConfig, describe_track, lay_track, track_provenance
 from subterra_jax.b2.track import TrackError, read_scene_track
@@ -278,19 +272,8 @@ def test_three_pieces_of_which_two_agree_by_chance_make_no_gauge():
     assert rails_seen._robust_spread(gauges) > rails_seen._PIECES_AGREE
 
 
-@pytest.fixture(scope="module")
-def built(tmp_path_factory) -> tuple[Reconstruction, float]:
-    folder = tmp_path_factory.mktemp("survey")
-    simulate(
-        SurveyConfig(folder, truth="metro", length=19.0, seed=601, tolerances=True, speed=2.0), Console(quiet=True)
-    )
-    with Stages(Console(quiet=True)) as progress:
-        found = reconstruct(folder / "survey.bag", folder / "groundtruth.tum", ReconstructConfig(), progress)
-    return found, json.loads((folder / "truth.json").read_text())["rails"]["gauge"]
-
-
-def test_single_returns_show_a_gauge_that_means_of_voxels_widen(built):
-    found, gauge = built
+def test_single_returns_show_a_gauge_that_means_of_voxels_widen(simulated):
+    found, gauge = simulated.found, simulated.truth["rails"]["gauge"]
     (line,) = found.seen.lines
     assert line.rails.measured
     assert line.rails.gauge == pytest.approx(gauge, abs=0.0015)
@@ -300,8 +283,8 @@ def test_single_returns_show_a_gauge_that_means_of_voxels_widen(built):
     assert line.rails.top == thinned.rails.top
 
 
-def test_few_or_blurred_returns_leave_the_gauge_as_it_was(built):
-    found, _ = built
+def test_few_or_blurred_returns_leave_the_gauge_as_it_was(simulated):
+    found = simulated.found
     rails = found.seen.lines[0].rails
     station, lateral, upward, height = above_floor(found.cloud.points.astype(np.float64), found.bore)
     again = measure_again(rails, station, lateral, height, upward)

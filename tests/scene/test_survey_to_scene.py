@@ -1,0 +1,62 @@
+"""A simulated survey through the builder, against the survey's own truth. Neither knows the other's code."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from benchmarks.truth import compare, load_truth
+from scene.geometry import make_axis
+
+
+def on_the_wall(bore: dict[str, np.ndarray], origin: np.ndarray) -> np.ndarray:
+    """Positions of the pockets in the survey frame, m."""
+    axis = make_axis(bore["station"], bore["position"], bore["tangent"])
+    pocket = bore["pocket"]
+    at = axis.at(pocket["station"])
+    row = np.rint(pocket["station"] / bore["station"][1]).astype(int).clip(0, len(bore["station"]) - 1)
+    radius = [
+        np.interp(a, bore["angle"], bore["radius"][k], period=2 * np.pi)
+        for a, k in zip(pocket["angle"], row, strict=True)
+    ]
+    across, along = radius * np.cos(pocket["angle"]), radius * np.sin(pocket["angle"])
+    return at.position + across[:, None] * at.lateral + along[:, None] * at.up + origin
+
+
+def test_axis_width_height_and_length_are_within_two_centimetres_of_the_truth(simulated):
+    figures = compare(simulated.scene, load_truth(simulated.survey / "truth.json")).figures()
+    assert figures["centreline_rmse"] < 0.02
+    assert figures["width_rmse"] < 0.02
+    assert figures["height_rmse"] < 0.02
+    assert abs(figures["length_error"]) < 0.15
+
+
+def test_pockets_are_found_where_they_are_with_size_and_depth(simulated):
+    with np.load(simulated.scene / "bore.npz") as data:
+        bore = {name: data[name] for name in data.files}
+    origin = np.asarray(json.loads((simulated.scene / "manifest.json").read_text())["frame"]["origin"])
+    held = [pocket for pocket in simulated.truth["pockets"] if pocket["open"]]
+    true = np.array([pocket["position"] for pocket in held])
+    distance, which = cKDTree(true).query(on_the_wall(bore, origin))
+    hits = len(set(which[distance < 0.15]))
+    assert 2 * hits / (len(distance) + len(true)) > 0.9
+    for size, within in (("depth", 0.015), ("length", 0.03), ("width", 0.03)):
+        assert bore["pocket"][size].mean() == pytest.approx(np.mean([pocket[size] for pocket in held]), abs=within)
+    assert np.median(np.diff(bore["ring_station"])) == pytest.approx(simulated.truth["rings"]["width"], abs=0.01)
+
+
+def test_sleepers_lie_where_the_survey_shows_them(simulated):
+    track = json.loads((simulated.scene / "manifest.json").read_text())["track"]
+    assert track["sleepers_seen"] == pytest.approx(len(simulated.truth["sleepers"]["station"]), abs=2)
+    assert track["protrusion"] == pytest.approx(0.06, abs=0.01)
+    assert track["gauge_seen"] == pytest.approx(simulated.truth["rails"]["gauge"], abs=0.01)
+
+
+def test_a_simulated_survey_is_labelled_so_everywhere(simulated):
+    manifest = json.loads((simulated.scene / "manifest.json").read_text())
+    assert manifest["input_provenance"] == "simulated"
+    assert manifest["provenance"]["sleepers"] == "simulated"
+    assert "measured" not in manifest["provenance"].values()
+    with np.load(simulated.scene / "tunnel.npz") as tunnel:
+        assert str(tunnel["provenance"]) == "simulated"
