@@ -11,8 +11,8 @@ from scene.fitting.evidence import odds_by_place, pocket_over_wall
 from scene.fitting.mould import Holes
 from scene.fitting.section import Sections
 from scene.fitting.unroll import Grid
+from tests.scene.fits import fitted, thin
 from tests.scene.test_lining import DEPTH, HALF, JOINTS, LENGTH, OFFSET, RADIUS, ROWS
-from tests.scene.test_turned import fitted
 
 FILLED = 8  # every so many places: a pocket mortared flush, where the mortar gives half of the echoes
 BEYOND, THIN = 0.30, 0.6  # m from a pocket away from its joint; share of the echoes that is missing there
@@ -52,9 +52,10 @@ def mortared() -> tuple[np.ndarray, np.ndarray]:
 @pytest.fixture(scope="module")
 def wall() -> tuple[Bore, Sections, np.ndarray]:
     points, place = mortared()
-    bore, sections, origin = fitted(points)
+    cloud = thin(points)
+    bore, sections = fitted(cloud, (np.full(3, 40.0), np.array([40.0 + LENGTH, 40.0, 40.0])))
     at = np.column_stack([place[:, 0], RADIUS * np.cos(place[:, 1]), RADIUS * np.sin(place[:, 1])])
-    return bore, sections, at + 40.0 - origin
+    return bore, sections, at + 40.0 - cloud.origin
 
 
 def count_hits(wall: tuple) -> tuple[int, int]:
