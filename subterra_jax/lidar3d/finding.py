@@ -12,11 +12,13 @@ from subterra_jax.host.errors import SubterraError
 from subterra_jax.lidar import nvidia
 from subterra_jax.lidar.kernels import compiled_by_numba, fastest
 from subterra_jax.lidar3d import fused
+from subterra_jax.lidar3d.march import march
 from subterra_jax.lidar3d.meeting import Hits, Point, Tools, normals
-from subterra_jax.lidar3d.relay import march_in_relay
 from subterra_jax.lidar3d.relief import ARRAYS, Relief
 from subterra_jax.rows import rowwise
 
+# Rays that XLA marches in step: each takes as long as the one with most to do.
+IN_STEP = 256
 # Memory of a ray, bytes: origin, direction, block, limit, distance, entry, block again, each once more as a row.
 _BYTES = 2 * 4 * 11
 
@@ -67,9 +69,21 @@ def by_xla(
     limits: Float[Array, "n"],
 ) -> tuple[Hits, Point]:
     """Find the first triangle that each ray meets, and its normal, by XLA."""
-    tools = tools_of(relief)
-    hits = march_in_relay(tools, relief.n_x, origins, directions, blocks, limits)
-    return hits, normals(tools, tuple(origins.T), tuple(directions.T), hits)
+    tools, n = tools_of(relief), len(blocks)
+    size = min(n, IN_STEP)
+
+    def some(rows: Any) -> tuple[Hits, Point]:
+        origin, direction, block, limit = rows
+        origin, direction = tuple(origin.T), tuple(direction.T)
+        hits = march(tools, relief.n_x, origin, direction, block, limit)
+        return hits, normals(tools, origin, direction, hits)
+
+    def cut(row: Array) -> Array:
+        row = jnp.pad(row, [(0, -n % size), *[(0, 0)] * (row.ndim - 1)], mode="edge")
+        return row.reshape(-1, size, *row.shape[1:])
+
+    found = lax.map(some, jax.tree.map(cut, (origins, directions, blocks, limits)))
+    return jax.tree.map(lambda part: part.reshape(-1)[:n], found)
 
 
 def by_numba(relief: Relief, *rows: Any) -> tuple[Hits, Point]:

@@ -1,9 +1,10 @@
 """Marches a ray through a relief: from block to block, from cell to cell, until it meets a triangle.
 
-Written once, for many rays at a time, over the few operations that differ: XLA marches some thousand rays in step, a
-fused kernel as many as a warp has lanes. `native.marching` does the same for one ray after another on a CPU.
+Written once, for many rays in step, over the few operations that differ: XLA marches some hundred of them, a fused
+kernel as many as a warp has lanes. `native.marching` does the same for one ray after another on a CPU.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -61,9 +62,12 @@ def _any(mask: Bool[Array, "n"]) -> Bool[Array, ""]:
 
 def _cross_block(tools: Tools, n_x: int, origin: Point, direction: Point, limit: Array, rays: Rays) -> Rays:
     """Take each ray that goes on through its block."""
-    way = enter_block(tools, origin, direction, limit, rays)
+    way = _enter_block(tools, origin, direction, limit, rays)
     found, entry = _cross_cells(tools, n_x, way, rays.going & (way.end >= 0.0))
-    return leave_block(rays, way, limit, Hits(way.begin + found, entry, rays.block))
+    hits = _nearer(way.hits, Hits(way.begin + found, entry, rays.block))
+    going = rays.going & (way.leave < jnp.minimum(limit, hits.distance)) & (way.following >= 0)
+    following, reached = jnp.where(going, way.following, rays.block), jnp.where(going, way.leave, rays.reached)
+    return Rays(following, reached, hits, going)
 
 
 class Way(NamedTuple):
@@ -100,7 +104,7 @@ class Way(NamedTuple):
     first_cell: Int[Array, "n"]
 
 
-def enter_block(tools: Tools, origin: Point, direction: Point, limit: Array, rays: Rays) -> Way:
+def _enter_block(tools: Tools, origin: Point, direction: Point, limit: Array, rays: Rays) -> Way:
     """Put each ray into the frame of its block, meet the boxes there, and leap through the empty prism."""
     row = rays.block * N_FRAME
     frame = lambda i: tools.load("frame", row + i)  # noqa: E731
@@ -137,14 +141,6 @@ def enter_block(tools: Tools, origin: Point, direction: Point, limit: Array, ray
         link(2),
         link(3),
     )
-
-
-def leave_block(rays: Rays, way: Way, limit: Array, found: Hits) -> Rays:
-    """Return rays in their next blocks, with what they met in the last."""
-    hits = _nearer(way.hits, found)
-    going = rays.going & (way.leave < jnp.minimum(limit, hits.distance)) & (way.following >= 0)
-    following, reached = jnp.where(going, way.following, rays.block), jnp.where(going, way.leave, rays.reached)
-    return Rays(following, reached, hits, going)
 
 
 def _nearer(one: Hits, other: Hits) -> Hits:
@@ -203,7 +199,7 @@ class Step(NamedTuple):
     going: Bool[Array, "n"]
 
 
-def ray_in_cells(tools: Tools, way: Way) -> Ray:
+def _ray_in_cells(tools: Tools, way: Way) -> Ray:
     """Return what rays in their blocks need at every cell."""
     at, d, along, across = way.at, way.d, way.along, way.across * FINE
     # Vertices count from 0 along the axis.
@@ -215,32 +211,8 @@ def ray_in_cells(tools: Tools, way: Way) -> Ray:
     return Ray(units, speeds, (at[0] - way.low) * way.per_cell, slope, forward, onward)
 
 
-def first_step(tools: Tools, n_x: int, way: Way, ray: Ray, going: Bool[Array, "n"]) -> Step:
-    """Return rays in the cells where they begin."""
-    first_x = jnp.clip(ray.x, 0.0, n_x - 1.0).astype(jnp.int32)
-    wedge = wedge_at(tools, way.at[1], way.at[2])
-    nothing = jnp.full_like(way.end, jnp.inf)
-    return Step(first_x, wedge, jnp.zeros_like(way.end), nothing, jnp.full_like(first_x, -1), going)
-
-
-class Stay(NamedTuple):
-    """Stays of rays in one cell each.
-
-    Attributes:
-        first: First entry of the cell's list.
-        listed: Number of entries that the ray must be compared with.
-        leave: Distance at which it leaves, m.
-        ends: True where it leaves through an end of the cell, not through a side of its wedge.
-    """
-
-    first: Int[Array, "n"]
-    listed: Int[Array, "n"]
-    leave: Float[Array, "n"]
-    ends: Bool[Array, "n"]
-
-
-def enter_cell(tools: Tools, n_x: int, way: Way, ray: Ray, step: Step) -> Stay:
-    """Look up the lists of the cells where rays are, empty for a ray that does not come near its triangles."""
+def _cross_cell(tools: Tools, n_x: int, way: Way, ray: Ray, step: Step) -> Step:
+    """Compare rays with the triangles of their cells, if they come near these, and take them to the next cells."""
     at, d = way.at, way.d
     edge = step.x + ray.forward
     # The outermost cells reach to infinity.
@@ -259,38 +231,27 @@ def enter_cell(tools: Tools, n_x: int, way: Way, ray: Ray, step: Step) -> Stay:
     first, word = tools.load("cell", way.first_cell + step.x * N_WEDGES + step.wedge)
     near = (word & 0xFFFF).astype(jnp.float32)
     reaches = step.going & ((depth + MARGIN) * (1.0 / NEAR_UNIT) >= near)
-    return Stay(first, jnp.where(reaches, lax.shift_right_logical(word, 16), 0), leave, leave_x <= leave_wedge)
+    listed = jnp.where(reaches, lax.shift_right_logical(word, 16), 0)
 
+    def one_triangle(i: Array, best: tuple[Array, Array]) -> tuple[Array, Array]:
+        return meet_one(tools, way.first_vertex, ray, first + i, i < listed, *best)
 
-def leave_cell(way: Way, ray: Ray, step: Step, stay: Stay) -> Step:
-    """Return rays in their next cells; `step` has the nearest triangles so far."""
-    going = step.going & (stay.leave < way.end) & (step.hit > stay.leave)
-    x = step.x + jnp.where(stay.ends & going, 2 * ray.forward - 1, 0)
-    wedge = step.wedge + jnp.where(stay.ends | ~going, 0, jnp.where(ray.onward, 1, -1))
+    hit, entry = lax.fori_loop(0, jnp.max(listed), one_triangle, (step.hit, step.entry))
+    going, ends = step.going & (leave < way.end) & (hit > leave), leave_x <= leave_wedge
+    x = step.x + jnp.where(ends & going, 2 * ray.forward - 1, 0)
+    wedge = step.wedge + jnp.where(ends | ~going, 0, jnp.where(ray.onward, 1, -1))
     wedge = jnp.where(wedge == N_WEDGES, 0, jnp.where(wedge < 0, N_WEDGES - 1, wedge))
-    return Step(x, wedge, jnp.where(going, stay.leave, step.reached), step.hit, step.entry, going)
+    return Step(x, wedge, jnp.where(going, leave, step.reached), hit, entry, going)
 
 
 def _cross_cells(
     tools: Tools, n_x: int, way: Way, going: Bool[Array, "n"]
 ) -> tuple[Float[Array, "n"], Int[Array, "n"]]:
     """Return the distance at which rays meet a triangle in their block, m, or `inf`, and its entry."""
-    ray = ray_in_cells(tools, way)
-
-    def one_cell(step: Step) -> Step:
-        stay = enter_cell(tools, n_x, way, ray, step)
-        hit, entry = _meet(tools, way, ray, stay, step)
-        return leave_cell(way, ray, step._replace(hit=hit, entry=entry), stay)
-
-    start = first_step(tools, n_x, way, ray, going)
+    ray = _ray_in_cells(tools, way)
+    first_x, nothing = jnp.clip(ray.x, 0.0, n_x - 1.0).astype(jnp.int32), jnp.full_like(way.end, jnp.inf)
+    wedge = wedge_at(tools, way.at[1], way.at[2])
+    start = Step(first_x, wedge, jnp.zeros_like(way.end), nothing, jnp.full_like(first_x, -1), going)
+    one_cell = partial(_cross_cell, tools, n_x, way, ray)
     step = lax.while_loop(lambda step: _any(step.going), one_cell, start)
     return step.hit, step.entry
-
-
-def _meet(tools: Tools, way: Way, ray: Ray, stay: Stay, step: Step) -> tuple[Float[Array, "n"], Int[Array, "n"]]:
-    """Compare rays with the triangles of a list each; return the nearest distance, m, and its entry."""
-
-    def one_triangle(i: Array, best: tuple[Array, Array]) -> tuple[Array, Array]:
-        return meet_one(tools, way.first_vertex, ray, stay.first + i, i < stay.listed, *best)
-
-    return lax.fori_loop(0, jnp.max(stay.listed), one_triangle, (step.hit, step.entry))

@@ -12,7 +12,7 @@ import pytest
 import subterra_jax as st
 from subterra_jax import lidar, lidar3d, native
 from subterra_jax.lidar import nvidia
-from subterra_jax.lidar3d import beams, casting, finding, fused, march, relay
+from subterra_jax.lidar3d import beams, casting, finding, fused
 from subterra_jax.lidar3d.relief import Relief, stack_reliefs
 from subterra_jax.lidar3d.surface import BOX_CORNERS, BOX_FACES, Axis, Triangles
 from tests.subterra_jax import surfaces
@@ -246,17 +246,13 @@ def test_machine_code_and_xla_give_the_same_ranges(bend, reliefs, name):
     assert (triangle[np.asarray(xla.entry)] == triangle[np.asarray(code.entry)]).mean() > 0.98
 
 
-def test_rays_that_take_each_others_places_meet_what_they_meet_in_step(bend, reliefs, monkeypatch):
+def test_rays_marched_a_few_at_a_time_meet_what_all_meet_in_step(bend, reliefs, monkeypatch):
     rays = bend_rays(bend[0], 56, 6)
-
-    def in_step(relief, origin, way, block, limit):
-        return march.march(finding.tools_of(relief), relief.n_x, tuple(origin.T), tuple(way.T), block, limit)
-
-    whole = found_by(in_step, reliefs["bend"], *rays)
-    monkeypatch.setattr(relay, "N_PLACES", 9)
-    relayed, _ = found_by(finding.by_xla, reliefs["bend"], *rays)
-    np.testing.assert_array_equal(whole.entry, relayed.entry)
-    np.testing.assert_allclose(whole.distance, relayed.distance, rtol=1e-6)
+    whole, _ = found_by(finding.by_xla, reliefs["bend"], *rays)
+    monkeypatch.setattr(finding, "IN_STEP", 9)
+    few, _ = found_by(lambda *arguments: finding.by_xla(*arguments), reliefs["bend"], *rays)
+    np.testing.assert_array_equal(whole.entry, few.entry)
+    np.testing.assert_allclose(whole.distance, few.distance, rtol=1e-6)
 
 
 def test_bores_picked_from_a_stack_give_what_each_gives_alone(bend, reliefs):
