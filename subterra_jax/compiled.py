@@ -15,8 +15,8 @@ import jax
 import jax.numpy as jnp
 from jax.experimental.compilation_cache import compilation_cache
 
-from subterra_jax.host.cache import cache_folder, make_writable
 from subterra_jax.host.errors import SubterraError
+from subterra_jax.host.files import cache_folder, make_writable
 
 _Method = TypeVar("_Method", bound=Callable[..., Any])
 

@@ -141,7 +141,6 @@ MISTAKES = {
     "subterra_jax.recorder --out o --task Subterra/StopAt-v7": "its id is Subterra/StopAt-v1",
     "subterra_jax.recorder --out o --agent policy:junk.safetensors": "damaged policy",
     "subterra_jax.recorder --out o --episode 500": "500",
-    "subterra_jax.recorder --out o --sensor vlp16 --beams 90": "beams belong to the planar LiDAR",
     "subterra_jax.recorder --out text.txt/x": "text.txt: is a file",
     "subterra_jax.recorder --out o --truth text.txt": "text.txt: exists already",
     "subterra_jax.b2.film": "arguments are required: out",

@@ -10,7 +10,6 @@ import dataclasses
 import numpy as np
 
 from subterra_jax.baselines.agent import range_sigma
-from subterra_jax.baselines.avoidance import steering_of
 from subterra_jax.baselines.cloud import commanded_cloud
 from subterra_jax.baselines.exactscan import ExactParams
 from subterra_jax.baselines.histogram import HistogramLocaliser
@@ -18,7 +17,7 @@ from subterra_jax.baselines.navigator import Navigator
 from subterra_jax.baselines.particle import ParticleLocaliser
 from subterra_jax.baselines.scanmodel import ScanModel
 from subterra_jax.baselines.stations import Localiser
-from subterra_jax.baselines.steering import CentreLine
+from subterra_jax.baselines.steering import CentreLine, steering_of
 from subterra_jax.state import EnvParams
 
 NAME = "ceiling"

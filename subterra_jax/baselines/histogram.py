@@ -17,14 +17,13 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from subterra_jax.baselines.agent import Known, Observed, range_sigma
-from subterra_jax.baselines.avoidance import steering_of
 from subterra_jax.baselines.cloud import CloudParams, cloud_params
 from subterra_jax.baselines.exactscan import ExactParams, exact_likelihood
 from subterra_jax.baselines.navigator import Navigator
 from subterra_jax.baselines.reckoning import Reckoning, begin_reckoning, odometer_share, reckon, unobserved_distance
 from subterra_jax.baselines.scanmodel import ScanModel, TunnelPose, fit, fit_roughly, move_pose
 from subterra_jax.baselines.stations import Driven, Localiser, Station, told_start
-from subterra_jax.baselines.steering import CentreLine
+from subterra_jax.baselines.steering import CentreLine, steering_of
 from subterra_jax.baselines.wallmap import WallMap, wall_map
 from subterra_jax.state import EnvParams
 

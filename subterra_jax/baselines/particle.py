@@ -9,7 +9,6 @@ from flax import struct
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from subterra_jax.baselines.agent import Known, Observed, range_sigma
-from subterra_jax.baselines.avoidance import steering_of
 from subterra_jax.baselines.cloud import (
     Cloud,
     CloudParams,
@@ -33,7 +32,7 @@ from subterra_jax.baselines.reckoning import (
 )
 from subterra_jax.baselines.scanmodel import ScanModel, TunnelPose, fit, fit_roughly
 from subterra_jax.baselines.stations import Driven, Localiser, Station, told_start
-from subterra_jax.baselines.steering import CentreLine
+from subterra_jax.baselines.steering import CentreLine, steering_of
 from subterra_jax.baselines.wallmap import WallMap, wall_map
 from subterra_jax.state import EnvParams
 

@@ -9,7 +9,6 @@ from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from subterra_jax.baselines.agent import Action, Agent, Known, Observed
-from subterra_jax.baselines.avoidance import steering_of
 from subterra_jax.baselines.ceiling import NAME as BAYES
 from subterra_jax.baselines.ceiling import ceiling
 from subterra_jax.baselines.fused import FusedCount
@@ -19,7 +18,7 @@ from subterra_jax.baselines.navigator import Navigator
 from subterra_jax.baselines.particle import particle_filter
 from subterra_jax.baselines.scanmatch import scan_matching
 from subterra_jax.baselines.stations import OdometerCount, Truth
-from subterra_jax.baselines.steering import CentreLine
+from subterra_jax.baselines.steering import CentreLine, steering_of
 from subterra_jax.compiled import in_32_bits
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.state import EnvParams

@@ -13,13 +13,12 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from subterra_jax.baselines.agent import Known, Observed, level_ranges, range_sigma
-from subterra_jax.baselines.avoidance import steering_of
 from subterra_jax.baselines.cloud import CloudParams, cloud_params
 from subterra_jax.baselines.navigator import Navigator
 from subterra_jax.baselines.reckoning import Reckoning, begin_reckoning, odometer_share, reckon, unobserved_distance
 from subterra_jax.baselines.scanmodel import TunnelPose, move_pose
 from subterra_jax.baselines.stations import Driven, Localiser, Station, told_start
-from subterra_jax.baselines.steering import CentreLine, find_walls
+from subterra_jax.baselines.steering import CentreLine, find_walls, steering_of
 from subterra_jax.lidar import bearings
 from subterra_jax.state import EnvParams
 

@@ -103,7 +103,7 @@ class _Add:
     def __call__(self, now: Episode, taken: Taken, here: EnvParams) -> tuple[Tally, Array]:
         """Count a step; a success by coverage stops the count, and the robot drives on to the far mouth."""
         ended = taken.terminated | taken.truncated
-        counted = add_step(now.tally, taken, self.env.rule.tolerance(here), here.tunnel.ring_pitch)
+        counted = add_step(now.tally, taken, self.env.rule.tolerance(here))
         tally = jax.tree.map(lambda old, new: jnp.where(now.tally.over, old, new), now.tally, counted)
         tally = dataclasses.replace(tally, progress=taken.info["coverage"], over=now.tally.over | ended)
         if self.env.rule.covers:

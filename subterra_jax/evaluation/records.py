@@ -14,7 +14,7 @@ from subterra_jax.tunnel_env import TunnelEnv
 N_RESAMPLES = 2000
 _MEANS = (
     "coverage", "progress", "spl", "clearance", "offset", "lateral", "time", "jerk", "axial_rms", "drift",
-    "time_to_lock", "cycle_slips", "crps", "nees",
+    "time_to_lock", "crps", "nees",
 )  # fmt: skip
 _SIZES = ("goal_error", "axial_final")  # whose mean would hide it
 
@@ -46,7 +46,6 @@ class Records:
         drift: |axial_final| in % of the distance driven.
         time_to_lock: Time from which the estimate stayed within the task's tolerance (1 m where it has none), s; NaN
             where it was not within it at the end.
-        cycle_slips: Rings by which the estimate slipped; NaN where the lining has no rings.
         crps: Mean continuous ranked probability score of the estimate, m.
         nees: Mean squared error over claimed variance; 1 from one who knows how well it knows.
 
@@ -74,7 +73,6 @@ class Records:
     axial_rms: Float[np.ndarray, " n"]
     drift: Float[np.ndarray, " n"]
     time_to_lock: Float[np.ndarray, " n"]
-    cycle_slips: Float[np.ndarray, " n"]
     crps: Float[np.ndarray, " n"]
     nees: Float[np.ndarray, " n"]
 
@@ -84,23 +82,12 @@ class Records:
     def where(self, chosen: Bool[np.ndarray, " n"]) -> "Records":
         return Records(**{field.name: getattr(self, field.name)[chosen] for field in dataclasses.fields(self)})
 
-    def as_columns(self) -> dict[str, list[Any]]:
-        """Return plain lists by name, for JSON; NaN becomes None."""
-
-        def plain(values: np.ndarray) -> list[Any]:
-            if values.dtype.kind != "f":
-                return values.tolist()
-            return [None if np.isnan(value) else value for value in values.tolist()]
-
-        return {field.name: plain(getattr(self, field.name)) for field in dataclasses.fields(self)}
-
 
 def make_records(tally: Any, episodes: Episodes, env: TunnelEnv, params: EnvParams) -> Records:
     """Make records of the `Tally` of finished episodes, fetched to the host."""
     steps, period = np.maximum(tally.steps, 1), float(np.max(params.vehicle.period))
     travelled, found = tally.travelled.astype(float), tally.estimates
     per_metre = _over(np.ones(len(episodes)), travelled)
-    pitch = np.broadcast_to(np.asarray(params.tunnel.ring_pitch), params.tunnel.count)[episodes.tunnel]
     covers = env.rule.errand == "cover"
     error = found.error.astype(float)
     estimated = ~np.isnan(found.square)
@@ -125,7 +112,6 @@ def make_records(tally: Any, episodes: Episodes, env: TunnelEnv, params: EnvPara
         axial_rms=np.sqrt(found.square / steps),
         drift=100.0 * np.abs(np.where(estimated, error, np.nan)) * per_metre,
         time_to_lock=np.where(locked, found.unlocked * period, np.nan),
-        cycle_slips=np.where(estimated & (pitch > 0.0), found.slips, np.nan),
         crps=found.crps / steps,
         nees=found.nees / steps,
     )
@@ -215,11 +201,6 @@ def interval(
     drawn = statistic(scores[np.arange(strata)[None, :, None], index])
     low, high = np.quantile(drawn, [0.5 - level / 2.0, 0.5 + level / 2.0])
     return float(low), float(high)
-
-
-def normalised(score: float, floor: float, ceiling: float) -> float | None:
-    """Scale a score to 0 for dead reckoning and 1 for the oracle; None where those two do not differ by a hundredth."""
-    return None if ceiling - floor < 0.01 else (score - floor) / (ceiling - floor)
 
 
 def area(severity: Float[np.ndarray, " n"], success: Float[np.ndarray, " n"]) -> float:

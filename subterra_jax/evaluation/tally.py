@@ -12,8 +12,6 @@ from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel import CONTACT_REACH
 from subterra_jax.tunnel_env import TunnelEnv
 
-_SLIPPED = 0.75  # of a ring: the nearest ring must be left for good before that counts
-
 
 @struct.dataclass
 class EstimateTally:
@@ -24,8 +22,6 @@ class EstimateTally:
     crps: Float[Array, ""]  # sum of the continuous ranked probability scores, m
     nees: Float[Array, ""]  # sum of squared errors over claimed variances, 1
     unlocked: Int[Array, ""]  # last step after which the error was beyond the tolerance; 0 for never
-    ring: Float[Array, ""]  # rings by which the estimate is off
-    slips: Float[Array, ""]  # rings by which that has changed since the first estimate
 
 
 @struct.dataclass
@@ -70,14 +66,13 @@ def start_tally(env: TunnelEnv, state: State, here: EnvParams) -> Tally:
     )
 
 
-def add_step(tally: Tally, taken: Taken, tolerance: Float[Array, ""], ring_pitch: Float[Array, ""]) -> Tally:
+def add_step(tally: Tally, taken: Taken, tolerance: Float[Array, ""]) -> Tally:
     """Add one step.
 
     Args:
         tally: Sums so far.
         taken: The step.
         tolerance: Error up to which an estimate counts as right, m.
-        ring_pitch: Distance between rings, m; 0 where there are none.
     """
     info, estimate = taken.info, taken.action[2:4]
     moved = taken.after.position - taken.before.position
@@ -96,16 +91,14 @@ def add_step(tally: Tally, taken: Taken, tolerance: Float[Array, ""], ring_pitch
         contact=info["contact"],
         goal_error=info.get("goal_error", tally.goal_error),
         coverage=info["coverage"],
-        estimates=add_estimate(
-            tally.estimates, error, info["estimate_log_sigma"], steps, jnp.asarray(tolerance), ring_pitch
-        ),
+        estimates=add_estimate(tally.estimates, error, info["estimate_log_sigma"], steps, jnp.asarray(tolerance)),
     )
 
 
 def start_estimates() -> EstimateTally:
     """Begin the scores of an estimate."""
     zero = jnp.zeros(())
-    return EstimateTally(zero, zero, zero, zero, jnp.zeros((), jnp.int32), zero, zero)
+    return EstimateTally(zero, zero, zero, zero, jnp.zeros((), jnp.int32))
 
 
 def add_estimate(
@@ -114,7 +107,6 @@ def add_estimate(
     log_sigma: Float[Array, ""],
     step: Int[Array, ""],
     tolerance: Float[Array, ""],
-    ring_pitch: Float[Array, ""],
 ) -> EstimateTally:
     """Add one step.
 
@@ -124,21 +116,14 @@ def add_estimate(
         log_sigma: Log of the claimed standard deviation in m.
         step: Number of the step, from 1.
         tolerance: Error up to which the estimate counts as locked, m.
-        ring_pitch: Distance between rings, m; 0 where there are none: no slips then.
     """
     sigma = jnp.exp(log_sigma)
-    off = jnp.where(ring_pitch > 0.0, error / jnp.maximum(ring_pitch, 1e-6), 0.0)
-    off = jnp.where(jnp.isnan(off), 0.0, off)
-    first: Bool[Array, ""] = step == 1
-    ring = jnp.where(first | (jnp.abs(off - tally.ring) > _SLIPPED), jnp.round(off), tally.ring)
     return EstimateTally(
         error=error,
         square=tally.square + error * error,
         crps=tally.crps + crps(error, sigma),
         nees=tally.nees + (error / sigma) ** 2,
         unlocked=jnp.where(jnp.abs(error) <= tolerance, tally.unlocked, step),
-        ring=ring,
-        slips=tally.slips + jnp.where(first, 0.0, jnp.abs(ring - tally.ring)),
     )
 
 

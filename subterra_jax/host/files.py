@@ -1,6 +1,5 @@
-"""Files and folders that appear whole or not at all, and early checks that they can be written."""
+"""Files and folders that appear whole or not at all, early checks that they can be written, and the cache folder."""
 
-import ctypes
 import glob
 import os
 import shutil
@@ -11,8 +10,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from subterra_jax.host.errors import OutputError
-
-_AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # Linux, renameat2(2)
 
 
 def require_folder(path: Path) -> Path:
@@ -89,10 +86,9 @@ def replace_folder(path: Path) -> Iterator[Path]:
         shutil.rmtree(fresh, ignore_errors=True)
         fresh.mkdir(parents=True)
         yield fresh
-        if path.exists() and not _exchange(fresh, path):
+        if path.exists():
             path.rename(stale)
-        if not path.exists():
-            fresh.rename(path)
+        fresh.rename(path)
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
     finally:
@@ -120,10 +116,15 @@ def _put_back(path: Path, stale: Path) -> None:
     shutil.rmtree(stale, ignore_errors=True)
 
 
-def _exchange(one: Path, other: Path) -> bool:
-    """Swaps two folders in one step, so that neither path is ever empty; `False` where the system cannot."""
+def cache_folder(name: str) -> Path:
+    """Return the folder of what can be made again; it need not exist, and may be deleted at any time."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "subterra" / name
+
+
+def make_writable(folder: Path) -> bool:
+    """Make a folder if it is not there, and tell whether it can be written."""
     try:
-        swap = ctypes.CDLL(None, use_errno=True).renameat2
-    except (OSError, AttributeError):  # no Linux, or one before 2014
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
         return False
-    return swap(_AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other), _RENAME_EXCHANGE) == 0
+    return os.access(folder, os.W_OK)

@@ -15,7 +15,7 @@ import numba.core.config
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from subterra_jax.host.cache import cache_folder, make_writable
+from subterra_jax.host.files import cache_folder, make_writable
 from subterra_jax.native.kernels import clearance_rows, scan_rows
 from subterra_jax.native.threads import API_VERSION, handler_of, sizes_of
 from subterra_jax.tunnel import CONTACT_REACH, Tunnel

@@ -256,12 +256,6 @@ class Faults(Part):
     def info(self, own: FaultState) -> dict[str, Array]:
         return {"severity": own.severity}
 
-    def with_beams(self, own: FaultState, share: float) -> FaultState:
-        """Keep the lost sector as wide as it was."""
-        return dataclasses.replace(
-            own, dropout_first=own.dropout_first * share, dropout_count=own.dropout_count * share
-        )
-
     def levels(self, params: EnvParams) -> range:
         return range(int(np.min(params.faults.severity_low)), int(np.max(params.faults.severity_high)) + 1)
 

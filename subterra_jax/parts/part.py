@@ -233,10 +233,6 @@ class Part(abc.ABC):
         """Return the params with one level of difficulty."""
         return params
 
-    def with_beams(self, own: Any, share: float) -> Any:
-        """Return the state for a LiDAR of `share` times as many beams."""
-        return own
-
     def boxes(self, own: Any, station: Array, tunnel: Tunnel, params: EnvParams) -> list[Boxes]:
         """Return boxes near a station, for pictures."""
         return []

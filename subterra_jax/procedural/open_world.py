@@ -178,7 +178,6 @@ def plan(
         lidar_height=bore.mount.height,
         linings={variant: cut_lining(bore, alignment, variant, rough) for variant in variants},
         ring_pitch=0.0 if rings is None else rings.nominal,
-        ring_joint=np.zeros(0) if rings is None else rings.joint,
         shell=make_shell(drawn.bore, alignment, drawn.grade, variants) if solid else None,
     )
 

@@ -39,7 +39,6 @@ class RecorderConfig:
         sensor: The robot's own LiDAR: `planar16`, or `spin16x64`, `vlp16`, `os1-64`, `avia` in three dimensions, whose
             returns are recorded as `/points` in place of `/scan`.
         every: Steps from one `/points` to the next.
-        beams: Beams of a further planar scan in `/scan_dense`; none if 0.
         imu: Record an IMU at 100 Hz.
         steps: Steps after which the recording ends if the episode has not; the task's horizon if left out.
         truth: Folder for the truth, if it is to lie elsewhere.
@@ -54,7 +53,6 @@ class RecorderConfig:
     lining: str | None = None
     sensor: SensorName = "planar16"
     every: int = 1
-    beams: int = 0
     imu: bool = False
     steps: int | None = None
     truth: Path | None = None
@@ -77,7 +75,7 @@ def check_config(config: RecorderConfig) -> RecorderConfig:
         RecorderError: A number is out of range, two settings exclude each other, or a folder exists already.
         OutputError: A folder cannot be written.
     """
-    least = {"every": 1, "beams": 0, "seed": 0}
+    least = {"every": 1, "seed": 0}
     if config.steps is not None:
         least["steps"] = 1
     if config.episode is not None:
@@ -87,8 +85,6 @@ def check_config(config: RecorderConfig) -> RecorderConfig:
             raise RecorderError(f"{name} must be at least {value}, got {getattr(config, name)}")
     if config.seed >= 2**32:
         raise RecorderError(f"seed must be below 2**32, got {config.seed}")
-    if config.sensor != SENSORS[0] and config.beams:
-        raise RecorderError(f"beams belong to the planar LiDAR, and the sensor is {config.sensor!r}")
     for folder in (config.recording_folder, config.truth_folder):
         if folder.exists():
             raise RecorderError(f"{folder}: exists already; recordings are not overwritten")

@@ -30,7 +30,6 @@ from subterra_jax.recorder.sensors import (
     Inertial,
     Poses,
     axis_rows,
-    dense_scans,
     measure_imu,
     reckoned_poses,
     true_poses,
@@ -101,8 +100,6 @@ def _recording_facts(config: RecorderConfig, trace: Trace, world: World, topics:
     sensors: dict[str, Any] = {"lidar_height": world.sensor_height, "scan_beams": params.lidar.n_beams}
     if world.is_spatial:
         sensors |= {"sensor": config.sensor, "every": config.every, "cloud_range": float(params.lidar.range_max)}
-    if config.beams:
-        sensors["scan_dense_beams"] = config.beams
     if config.imu:
         sensors["imu_rate"] = IMU_RATE
     return {
@@ -207,9 +204,6 @@ def _write_recording(folder: Path, config: RecorderConfig, trace: Trace, world: 
         streams.append(_points(trace, trace.observation[:, parts["scan"]], world.params.lidar, config.every))
     else:
         streams.append(_scans("/scan", trace, trace.observation[:, parts["ranges"]], range_max))
-    if config.beams:
-        dense = dense_scans(trace, world.env, world.params, config.beams, seed)
-        streams.append(_scans("/scan_dense", trace, dense, range_max))
     if config.imu:
         streams.append(_imu(measure_imu(sensor, seed)))
     topics = write_bag(folder, _merge(streams))

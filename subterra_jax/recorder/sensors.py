@@ -5,19 +5,14 @@ left, z square to the track; `odom` is `base_link` at the start. Both LiDARs and
 """
 
 import dataclasses
-import functools
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from subterra_jax.recorder.trace import Trace, reckon
-from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel.plan import TunnelPlan
-from subterra_jax.tunnel_env import TunnelEnv
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,41 +120,3 @@ def measure_imu(poses: Poses, seed: int, noise: float = 1.0) -> Inertial:
     gyro = gyro + noise * (GYRO_SIGMA * white[0] + GYRO_WALK * walk[0] + GYRO_BIAS * bias[0])
     accel = accel + noise * (ACCEL_SIGMA * white[1] + ACCEL_WALK * walk[1] + ACCEL_BIAS * bias[1])
     return Inertial(time, gyro, accel)
-
-
-_SCANS = 128  # planar scans in one batch
-_DENSE_STREAM = 0x5CA7  # a separate key: the episode's draws stay as they are
-
-
-def dense_scans(
-    trace: Trace, env: TunnelEnv, params: EnvParams, n_beams: int, seed: int
-) -> Float[np.ndarray, "n n_beams"]:
-    """Take planar scans of more beams, with the same range, noise, boxes and faults as the task's own.
-
-    A sector that drops out is as wide as that of the task's LiDAR.
-
-    Args:
-        trace: The episode.
-        env: Its environment.
-        params: Its task.
-        n_beams: Beams, the first straight ahead, the others counter-clockwise.
-        seed: Seed of the episode.
-    """
-    n, wider = len(trace.observation), n_beams / params.lidar.n_beams
-    dense = params.replace(lidar=dataclasses.replace(params.lidar, n_beams=n_beams))
-    state = trace.state.replace(
-        **{part.name: part.with_beams(trace.state.parts[part.name], wider) for part in env.parts}
-    )
-    key = jax.random.fold_in(jax.random.key(jnp.uint32(seed)), _DENSE_STREAM)
-    rows = np.minimum(np.arange(-(-n // _SCANS) * _SCANS), n - 1).reshape(-1, _SCANS)
-    parts = [_perceive(env, jax.tree.map(lambda leaf, some=some: leaf[some], state), key, some, dense) for some in rows]
-    return np.concatenate([np.asarray(part) for part in parts])[:n]
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _perceive(env: TunnelEnv, state: State, key: Array, index: Array, params: EnvParams) -> Float[Array, "n n_beams"]:
-    def one(state: State, index: Array) -> Array:
-        noise = env.draw_step(jax.random.fold_in(key, index), (), params)
-        return env.observe(state, noise, params)[env.fields(params)["ranges"]]
-
-    return jax.vmap(one)(state, index)

@@ -11,90 +11,10 @@ from typing import Any
 import numpy as np
 
 from subterra_jax.host.errors import TunnelError
-from subterra_jax.host.tunnelfile import RADIUS, SCHEMA, decode, unit_field, write_tunnel
+from subterra_jax.host.tunnelfile import RADIUS, SCHEMA, decode, unit_field
 from subterra_jax.host.versions import BUILD_AGAIN, other_schema
 from subterra_jax.tunnel.plan import Lining, TunnelPlan, Wall
 from subterra_jax.tunnel.shell import N_BRICK, SPACING, Shell, ShellLining
-
-
-def save_tunnel(plan: TunnelPlan, path: str | Path) -> None:
-    """Write a tunnel as `tunnel.npz`; docs/formats.md says what each field means.
-
-    Lengths and angles are rounded to 1e-5 m and rad, radii to 0.1 mm. Stations become those of the shell, where there
-    is one.
-
-    Args:
-        plan: A whole tunnel, such as `load_tunnel(name, solid=True)` gives; without its shell the file serves planar
-            sensors alone.
-        path: File to write.
-
-    Raises:
-        TunnelError: The shell is that of a piece of a tunnel.
-    """
-    shell = plan.shell
-    if shell is not None:
-        if shell.window[0] > 0.0 or shell.window[1] < shell.station[-1]:
-            raise TunnelError(f"tunnel {plan.name!r} is a piece of a tunnel; save the whole")
-        plan = _on_stations_of(plan, shell)
-    facts: dict[str, Any] = {
-        "name": plan.name,
-        "provenance": plan.provenance,
-        "lidar_height": plan.lidar_height,
-        "ring_pitch": plan.ring_pitch,
-        "lining": list(plan.linings),
-    }
-    arrays = {
-        "station": plan.station,
-        "centre": plan.centre,
-        "tangent": plan.tangent,
-        "elevation": plan.elevation,
-        "half_width": plan.half_width,
-        "ring_joint": plan.ring_joint,
-    }
-    for name, lining in plan.linings.items():
-        for side, wall in (("left", lining.left), ("right", lining.right)):
-            arrays |= {f"{side}_{name}": wall.vertex, f"{side}_station_{name}": wall.station}
-        arrays[f"furniture_{name}"] = lining.furniture
-    if shell is not None:
-        facts |= {f"shell_seam_{name}": shell.linings[name].seam for name in plan.linings}
-        arrays |= _shell_arrays(plan, shell)
-    write_tunnel(Path(path), facts, arrays)
-
-
-def _shell_arrays(plan: TunnelPlan, shell: Shell) -> dict[str, np.ndarray]:
-    """Return the bore in three dimensions by field, for a plan at its stations."""
-    arrays = {
-        "shell_height": shell.position[:, 2] - plan.elevation,
-        "shell_rise": shell.tangent[:, 2],
-        "shell_angle": shell.angle,
-        "shell_section": shell.section,
-        RADIUS: shell.radius,
-        "shell_track": shell.track,
-        "shell_spacing": np.array(shell.spacing),
-    }
-    for name in plan.linings:
-        own = shell.linings[name]
-        arrays |= {f"shell_pocket_{name}": own.pocket, f"shell_brick_{name}": own.brick}
-        if own.radius is not None:
-            arrays[f"{RADIUS}_{name}"] = own.radius
-    return arrays
-
-
-def _on_stations_of(plan: TunnelPlan, shell: Shell) -> TunnelPlan:
-    """Return a plan at the stations of its shell, with its centreline under the shell's axis."""
-    level = np.hypot(shell.tangent[:, 0], shell.tangent[:, 1])[:, None]
-
-    def along(values: np.ndarray) -> np.ndarray:
-        return np.interp(shell.station, plan.station, values)
-
-    return dataclasses.replace(
-        plan,
-        station=shell.station,
-        centre=shell.position[:, :2],
-        tangent=shell.tangent[:, :2] / level,
-        elevation=along(plan.elevation),
-        half_width=along(plan.half_width),
-    )
 
 
 def describe_damage(path: Path, error: Exception) -> str:
@@ -179,7 +99,6 @@ def read_tunnel(path: Path) -> TunnelPlan:
         lidar_height=fields.number("lidar_height"),
         linings=_read_linings(fields),
         ring_pitch=ring_pitch,
-        ring_joint=fields.numbers("ring_joint", None) if "ring_joint" in fields.data else np.zeros(0),
         source=str(path),
     )
     if any(name.startswith("shell_") for name in fields.data):

@@ -61,7 +61,6 @@ class TunnelPlan:
         ring_pitch: Distance between ring joints by the drawings, which agents are told, m; 0 without rings, or if
             unknown. Pockets repeat with it.
         shell: The bore in three dimensions; `None` where it is not known.
-        ring_joint: Stations of the ring joints as built, which nobody is told, m, `(r,)`; empty where not known.
         source: File that it was read from; empty if from none.
     """
 
@@ -76,7 +75,6 @@ class TunnelPlan:
     linings: dict[str, Lining]
     ring_pitch: float = 0.0
     shell: Shell | None = None
-    ring_joint: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
     source: str = ""
 
     @property
@@ -132,7 +130,6 @@ class TunnelPlan:
                 for name, lining in self.linings.items()
             },
             shell=None if self.shell is None else self.shell.cut(start, end),
-            ring_joint=self.ring_joint[(self.ring_joint >= start) & (self.ring_joint <= end)] - start,
         )
 
     def _furniture(self, lining: Lining, start: float, end: float) -> np.ndarray:

@@ -1,24 +1,27 @@
 """Tunnels by name: packaged ones, files and generated ones."""
 
 import concurrent.futures
+import contextlib
 import dataclasses
 import functools
 import hashlib
 import os
-from collections.abc import Iterable, Sequence
+import pickle
+from collections.abc import Callable, Iterable, Sequence
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 
 from subterra_jax.host.errors import TunnelError
+from subterra_jax.host.files import cache_folder, make_writable, replace_file
 from subterra_jax.procedural import GENERATED, default_lining, expand, generate
 from subterra_jax.procedural.control import NAME as CONTROL
 from subterra_jax.procedural.open_world import in_benchmark
 from subterra_jax.tunnel.file import read_tunnel
-from subterra_jax.tunnel.kept import keep
 from subterra_jax.tunnel.plan import TunnelPlan
 from subterra_jax.tunnel.tunnel import Tunnel, stack
 
@@ -28,6 +31,8 @@ def tunnel_of(scene: Path) -> Path:
     return (scene if scene.is_dir() else scene.parent) / "tunnel.npz"
 
 
+_MOST = 2_000_000_000  # bytes of tunnels kept on disk; of more, those not used for longest go
+_MADE_BY = ("procedural", "tunnel", "lidar3d")  # packages whose code a tunnel's arrays depend on
 PACKAGED = ("subterra-351", "metro")  # the first is the default
 
 Source = Tunnel | TunnelPlan | str | Path | None
@@ -158,11 +163,11 @@ def _single(
     if not GENERATED.fullmatch(str(tunnel)):
         put = lambda: _put(load_tunnel(tunnel), lining, piece, reach, spatial)  # noqa: E731
         file = Path(str(tunnel_file(tunnel)))  # a surface takes a quarter of a minute
-        return keep(put, tunnel_digest(tunnel), lining, piece, reach) if spatial and file.is_file() else put()
+        return _kept(put, tunnel_digest(tunnel), lining, piece, reach) if spatial and file.is_file() else put()
     # No more than is needed is made.
     name, lining = str(tunnel), lining or default_lining(str(tunnel))
     make = lambda: _put(generate(name, (lining,), spatial), lining, piece, reach, spatial)  # noqa: E731
-    return keep(make, name, lining, piece, reach, spatial) if in_benchmark(name) else make()
+    return _kept(make, name, lining, piece, reach, spatial) if in_benchmark(name) else make()
 
 
 def _put(
@@ -180,3 +185,45 @@ def _put(
     from subterra_jax.lidar3d.space import Space  # it reads plans itself
 
     return dataclasses.replace(planar, space=Space.from_plan(plan, lining))
+
+
+def _kept(make: Callable[[], Tunnel], *content: Any) -> Tunnel:
+    """Return a tunnel from the cache, or make it and keep it there; where no folder can be written, just make it.
+
+    Args:
+        make: Makes the tunnel.
+        *content: All that the tunnel depends on beside the code: its name, lining, piece.
+    """
+    folder = cache_folder("tunnels")
+    if not make_writable(folder):
+        return make()
+    file = folder / f"{hashlib.sha256(repr((_code(), *content)).encode()).hexdigest()[:40]}.pickle"
+    with contextlib.suppress(OSError, EOFError, pickle.UnpicklingError):
+        content_bytes = file.read_bytes()
+        file.touch()  # it was used
+        return jax.device_put(pickle.loads(content_bytes))
+    made = make()
+    with contextlib.suppress(OSError):
+        with replace_file(file) as fresh:
+            fresh.write_bytes(pickle.dumps(jax.device_get(made)))
+        _shrink(folder)
+    return made
+
+
+@functools.cache
+def _code() -> str:
+    """Return a digest of the code that makes tunnels and of the library that it computes with."""
+    root = Path(__file__).parents[1]
+    files = [file for name in _MADE_BY for file in sorted((root / name).glob("*.py"))]
+    sources = b"".join(file.read_bytes() for file in files)
+    return hashlib.sha256(sources + np.__version__.encode()).hexdigest()
+
+
+def _shrink(folder: Path) -> None:
+    """Remove the tunnels that were not used for longest until no more than `_MOST` bytes are left."""
+    kept = sorted(((file.stat(), file) for file in folder.glob("*.pickle")), key=lambda one: -one[0].st_mtime)
+    total = 0
+    for facts, file in kept:
+        total += facts.st_size
+        if total > _MOST:
+            file.unlink(missing_ok=True)

@@ -10,9 +10,9 @@ import pytest
 import subterra_jax as st
 from subterra_jax.baselines import navigator, stations, steering
 from subterra_jax.baselines.agent import Observed
-from subterra_jax.baselines.avoidance import Avoidance
 from subterra_jax.baselines.registry import make_agent
 from subterra_jax.baselines.stations import Station
+from subterra_jax.baselines.steering import Avoidance
 from subterra_jax.evaluation import evaluate, listed_episodes
 from subterra_jax.parts.wander import WanderParams
 

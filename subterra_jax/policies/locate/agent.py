@@ -13,9 +13,8 @@ from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from subterra_jax.baselines.agent import Action, Known, Observed, n_ranges
-from subterra_jax.baselines.avoidance import steering_of
 from subterra_jax.baselines.navigator import Memory, Navigator
-from subterra_jax.baselines.steering import CentreLine
+from subterra_jax.baselines.steering import CentreLine, steering_of
 from subterra_jax.policies.files import Conditions, PolicyError
 from subterra_jax.policies.locate.map_strip import MapStrip
 from subterra_jax.policies.trained import Tensors, Trained

@@ -6,14 +6,12 @@ import pytest
 
 from subterra_jax.recorder import RecorderConfig, record
 
-BEAMS = 48
-
 
 @pytest.fixture(scope="session")
 def config(tmp_path_factory: pytest.TempPathFactory) -> RecorderConfig:
     out: Path = tmp_path_factory.mktemp("episode") / "one"
     where = {"task": "StopAtShort", "tunnel": "subterra-351"}
-    return RecorderConfig(out=out, **where, agent="dead-reckoning", episode=1, imu=True, beams=BEAMS)
+    return RecorderConfig(out=out, **where, agent="dead-reckoning", episode=1, imu=True)
 
 
 @pytest.fixture(scope="session")

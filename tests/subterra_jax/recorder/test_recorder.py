@@ -22,7 +22,7 @@ from subterra_jax.recorder.sensors import Poses
 
 TASK = "Subterra/StopAtShort-v1"
 TYPES = get_typestore(Stores.ROS2_JAZZY)
-TOPICS = {"/cmd_vel", "/imu", "/odom", "/scan", "/scan_dense", "/tf", "/tf_static"}
+TOPICS = {"/cmd_vel", "/imu", "/odom", "/scan", "/tf", "/tf_static"}
 
 
 @pytest.fixture(scope="session")

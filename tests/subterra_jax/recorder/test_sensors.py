@@ -1,26 +1,20 @@
-"""What the recorder adds to an episode: poses in three dimensions, dense scans, an IMU; known answers."""
+"""What the recorder adds to an episode: poses in three dimensions, an IMU; known answers."""
 
 import dataclasses
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-import pytest
 from scipy.spatial.transform import Rotation
 
 import subterra_jax as st
-from subterra_jax.lidar import LidarParams
 from subterra_jax.recorder.sensors import (
     GRAVITY,
     Poses,
-    dense_scans,
     measure_imu,
     reckoned_poses,
     true_poses,
 )
 from subterra_jax.recorder.trace import Trace
 from subterra_jax.state import State
-from tests.subterra_jax.recorder.conftest import BEAMS
 
 
 @dataclasses.dataclass
@@ -67,32 +61,6 @@ def test_an_odometer_without_errors_reckons_the_true_path():
     poses = reckoned_poses(trace_of(true, turn, turn), reading)
     np.testing.assert_allclose(poses.position[:, :2], true, atol=2e-3 * step * 60)
     np.testing.assert_allclose(poses.rotation.as_rotvec()[10, 2], turn[10], atol=1e-9)
-
-
-def test_without_noise_a_dense_scan_of_as_many_beams_is_the_tasks_own(trace):
-    env, params = st.make("Subterra/StopAtShort-v1", tunnel="subterra-351", lidar=LidarParams(range_sigma=0.0))
-    some = dataclasses.replace(trace, state=jax.tree.map(lambda leaf: leaf[:20], trace.state))
-    some = dataclasses.replace(some, observation=trace.observation[:20])
-    exact = dense_scans(some, env, params, 16, seed=1)
-    assert np.std((trace.observation[:20, :16] - exact)[exact < 29.0]) == pytest.approx(0.05, rel=0.2)
-    every_third = dense_scans(some, env, params, BEAMS, seed=1)[:, :: BEAMS // 16]
-    np.testing.assert_allclose(every_third, exact, atol=2e-4)
-
-
-@pytest.mark.slow
-def test_a_sector_that_drops_out_is_as_wide_in_the_dense_scan():
-    env, params = st.make("Subterra/Faulted-v1", tunnel="subterra-351", lidar=LidarParams(range_sigma=0.0))
-    begin = jax.jit(jax.vmap(lambda key: env.begin(env.draw_reset(key, (), params), params)))
-    states = begin(jax.random.split(jax.random.key(0), 2))
-    four = jnp.full(2, 4.0)
-    faults = dataclasses.replace(
-        states.faults, severity=0.0 * four, dropout_left=four, dropout_first=four, dropout_count=four
-    )
-    states = states.replace(faults=faults)
-    trace = of_states(jax.device_get(states), 2)
-    found = dense_scans(trace, env, params, 64, seed=0)
-    assert (found[:, 16:32] == 30.0).all()
-    assert (found[:, [8, 12]] < 30.0).all()
 
 
 def test_an_imu_on_a_circle_feels_the_turn_the_pull_inwards_and_gravity():

@@ -7,7 +7,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 import subterra_jax as st
-from subterra_jax.recorder import RecorderConfig, RecorderError, record
+from subterra_jax.recorder import RecorderConfig, record
 from subterra_jax.recorder.messages import POINT
 
 
@@ -51,9 +51,3 @@ def depth(shell, points, config, lift):
     left, up = (np.sum(apart * axis[node], axis=1) for axis in (shell.left, shell.up))
     column = np.round((np.arctan2(up, left) - shell.angle[0]) / (2 * np.pi) * len(shell.angle)).astype(int)
     return (np.hypot(left, up) - shell.radius[node, column % len(shell.angle)])[up > 0.3]
-
-
-def test_what_does_not_go_together_is_one_sentence(tmp_path):
-    with pytest.raises(RecorderError, match="beams belong to the planar LiDAR"):
-        record(RecorderConfig(out=tmp_path / "o", sensor="vlp16", beams=90))
-    assert not (tmp_path / "o").exists()
