@@ -25,21 +25,7 @@ def no_task(task: str, known: Iterable[str]) -> str:
         task: The id as it was given, with `Subterra/` or without.
         known: The ids that exist.
     """
-    if now := successor(task):
-        return f"no task {task!r}: version 1 is the benchmark; use {now}"
     name = task.removeprefix("Subterra/").partition("-v")[0]
     if (meant := full_id(name)) in BENCHMARK:
         return f"no task {task!r}: its id is {meant}"
     return f"no task {task!r}; there are {', '.join(known)}"
-
-
-def successor(task: str) -> str | None:
-    """Return what took the place of an id of version 0, or of an id of its own for a hidden start; None for others."""
-    name, _, version = task.removeprefix("Subterra/").partition("-v")
-    plain = name.replace("Offset", "")
-    if version not in ("0", "1") or (version == "1" and plain == name):
-        return None
-    for candidate in (full_id(plain), full_id(plain.removesuffix("Short"))):
-        if candidate in BENCHMARK:
-            return candidate + (" with hidden_start=True" if plain != name else "")
-    return None

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from subterra_jax.host.errors import SubterraError
-from subterra_jax.host.task_ids import successor
 from subterra_jax.host.versions import other_schema
 
 SCHEMA = "subterra.policy/1"
@@ -125,8 +124,6 @@ def _find(source: str) -> tuple[Traversable, Traversable]:
         if not tensors.is_file():
             raise PolicyError(f"{source}: holds no {CHECKPOINT_POLICY}{TENSORS}; {AGAIN}")
     if not tensors.is_file():
-        if now := successor(source):
-            raise PolicyError(f"{source}: no such policy: version 1 is the benchmark; its task is {now}")
         raise PolicyError(f"{source}: no such policy; released are {', '.join(packaged) or 'none'}")
     return tensors, tensors.with_name(tensors.name.removesuffix(TENSORS) + FACTS)
 
@@ -173,8 +170,6 @@ def _facts(path: Traversable, tensors: bytes) -> dict[str, Any]:
         raise PolicyError(f"{path}: {other_schema(found, SCHEMA, AGAIN)}")
     if missing := [name for name in _FACTS if name not in facts]:
         raise PolicyError(f"{path}: field {missing[0]!r} is missing")
-    if now := successor(str(facts["task"])):
-        raise PolicyError(f"{path}: trained for {facts['task']}, which is gone; train for {now}")
     if hashlib.sha256(tensors).hexdigest() != facts["tensors_sha256"]:
         raise PolicyError(f"{path}: damaged policy: the tensors beside it have another SHA-256")
     return facts

@@ -9,7 +9,6 @@ from subterra_jax.baselines.agent import Agent
 from subterra_jax.baselines.registry import AgentError
 from subterra_jax.compiled import in_32_bits
 from subterra_jax.host.loading import load_object
-from subterra_jax.host.task_ids import successor
 from subterra_jax.policies.files import PolicyError, is_policy
 from subterra_jax.policies.loading import PREFIX, check_fits, load, with_map
 from subterra_jax.policies.trained import Trained
@@ -89,8 +88,6 @@ def require_known(name: str) -> None:
 
 
 def _no_agent(name: str) -> str:
-    if now := successor(name):
-        return f"no agent {name!r}: version 1 is the benchmark; its task is {now}"
     return f"no agent {name!r}; there are {', '.join(registry.names())}; or {FORMS}"
 
 

@@ -1,4 +1,4 @@
-"""Dead reckoning: the truth when nothing drifts, and the stated statistics when it does."""
+"""Odometer and slip: the truth where nothing drifts, and errors with draws of their own; `net` has their sizes."""
 
 import jax
 import jax.numpy as jnp
@@ -7,10 +7,12 @@ import pytest
 
 import subterra_jax as st
 from subterra_jax.parts import odometer as odometry
+from subterra_jax.parts import slip, wander
 from subterra_jax.parts.wander import WanderParams
 
 TASK = "Subterra/TraverseShort-v1"
-N, T = 4000, 50
+N, T = 20_000, 50
+PARAMS = WanderParams(sigma=0.02, length=30.0)
 
 
 def drift(params: odometry.OdometryParams, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -50,20 +52,6 @@ def test_without_errors_the_observed_odometry_is_the_path_driven():
     assert float(obs[17]) == pytest.approx(float(state.heading) - start, abs=1e-5)
 
 
-@pytest.mark.parametrize("channel", [0, 1], ids=["distance", "heading"])
-def test_noise_and_bias_are_recovered_within_three_standard_errors(channel):
-    params = odometry.OdometryParams(0.01, 0.02, 0.001, 0.002)
-    steps = np.diff(drift(params)[channel], axis=1)
-    motion, noise_sigma, bias_sigma = [(0.1, 0.01, 0.02 * 0.1), (0.001, 0.001, 0.002 * 0.1)][channel]
-    # Within an episode the bias is constant, so that the spread of its steps is the noise.
-    noise = np.sqrt(np.mean(np.var(steps, axis=1, ddof=1)))
-    assert noise == pytest.approx(noise_sigma, abs=3 * noise_sigma / np.sqrt(2 * N * (T - 2)))
-    of_means = np.var(steps.mean(axis=1), ddof=1)
-    expected = bias_sigma**2 + noise_sigma**2 / (T - 1)
-    assert of_means == pytest.approx(expected, abs=3 * expected * np.sqrt(2 / N))
-    assert steps.mean() == pytest.approx(motion, abs=3 * np.sqrt(expected / N))
-
-
 def test_every_error_of_an_episode_has_a_draw_of_its_own():
     params = odometry.OdometryParams(0.0, 0.02, 0.0, 0.002, WanderParams(sigma=0.01), backward_bias_sigma=0.02)
     noise = jax.random.normal(jax.random.key(4), (N, params.n_reset_noise))
@@ -79,3 +67,42 @@ def test_dead_reckoned_headings_stay_within_half_a_turn():
             state, jnp.array([0.0, 1.5]), jnp.float32(0.1), jnp.zeros(2), odometry.OdometryParams()
         )
         assert abs(float(state.heading)) <= np.float32(np.pi)
+
+
+def test_a_wandering_error_keeps_its_spread_and_loses_its_memory_over_its_length():
+    first, *later = jax.random.normal(jax.random.key(0), (151, N))
+    value = start = jax.vmap(wander.start_wander, (0, None))(first, PARAMS)
+    advance = jax.jit(jax.vmap(wander.advance_wander, (0, None, 0, None)))
+    for noise in later:
+        value = advance(value, jnp.float32(0.2), noise, PARAMS)
+    start, value = np.asarray(start, np.float64), np.asarray(value, np.float64)
+    # Standard error of a standard deviation: sigma / sqrt(2 n); of a correlation: (1 - r²) / sqrt(n).
+    for sample in (start, value):
+        assert abs(sample.std() - 0.02) < 3 * 0.02 / np.sqrt(2 * N)
+    expected = np.exp(-1.0)
+    assert abs(np.corrcoef(start, value)[0, 1] - expected) < 3 * (1 - expected**2) / np.sqrt(N)
+
+
+def test_the_size_of_the_steps_does_not_matter_to_a_wandering_error():
+    one = wander.advance_wander(jnp.float32(0.02), jnp.float32(30.0), jnp.float32(0.0), PARAMS)
+    np.testing.assert_allclose(one, 0.02 * np.exp(-1.0), rtol=1e-5)
+    many = jnp.float32(0.02)
+    for _ in range(10):
+        many = wander.advance_wander(many, jnp.float32(-3.0), jnp.float32(0.0), PARAMS)
+    np.testing.assert_allclose(many, one, rtol=1e-5)
+    assert wander.advance_wander(jnp.float32(0.02), jnp.float32(0.0), jnp.float32(5.0), PARAMS) == jnp.float32(0.02)
+
+
+def test_slips_have_the_stated_spread_and_each_a_draw_of_its_own():
+    noise = jax.random.normal(jax.random.key(1), (N, 3))
+    states = jax.vmap(slip.start_slip, (0, None))(noise, slip.SlipParams())
+    motion = np.asarray(jax.vmap(slip.true_motion, (None, 0))(jnp.array([2.0, 0.1]), states), np.float64)
+    for channel, expected in enumerate((2.0 * np.hypot(0.02, 0.02), 0.002)):
+        assert abs(motion[:, channel].std() - expected) < 3 * expected / np.sqrt(2 * N)
+    errors = np.corrcoef([states.gain, states.yaw, states.wander])
+    np.testing.assert_allclose(errors, np.eye(3), atol=4.5 / np.sqrt(N))  # of independent numbers: 1 / sqrt(N)
+
+
+def test_a_robot_told_to_stand_stands():
+    state = slip.start_slip(jnp.array([3.0, 3.0, 3.0]), slip.SlipParams())
+    np.testing.assert_array_equal(slip.true_motion(jnp.zeros(2), state), np.zeros(2))

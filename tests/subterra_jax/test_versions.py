@@ -14,12 +14,10 @@ import subterra_jax as st
 from scene.bore import load_bore
 from scene.errors import RecordingError as SceneError
 from subterra_jax import policies
-from subterra_jax.host.errors import SubterraError
 from subterra_jax.host.task_ids import no_task
 from subterra_jax.host.versions import VERSION, other_schema
 from subterra_jax.lidar3d.surface import read_axis
-from subterra_jax.policies.files import PolicyError, read
-from subterra_jax.tasks import TaskError, find
+from subterra_jax.policies.files import PolicyError
 from train import checkpoint
 from train.checkpoint import CheckpointError
 from train.world import library_versions
@@ -116,47 +114,12 @@ def test_a_checkpoint_of_another_version_says_what_to_do(tmp_path):
             checkpoint.load_checkpoint(tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("gone", "now"),
-    [
-        ("Subterra/StopAt-v0", "Subterra/StopAt-v1"),
-        ("Subterra/Traverse-v0", "Subterra/Traverse-v1"),
-        ("Subterra/B2Walk-v0", "Subterra/B2Walk-v1"),
-        ("Subterra/B2Traverse-v0", "Subterra/B2Traverse-v1"),
-        ("FaultedShort-v0", "Subterra/Faulted-v1"),
-        ("Subterra/StopAtOffsetShort-v0", "Subterra/StopAtShort-v1 with hidden_start=True"),
-        ("Subterra/ReturnOffset-v1", "Subterra/Return-v1 with hidden_start=True"),
-    ],
-)
-def test_a_task_that_is_gone_names_its_successor_in_one_sentence(gone, now):
-    says = f"no task {gone!r}: version 1 is the benchmark; use {now}"
-    for refuse in (lambda: st.make(gone), lambda: find(gone, short=True)):
-        with pytest.raises(TaskError) as error:
-            refuse()
-        assert str(error.value) == says
-    policy = gone.removeprefix("Subterra/")
-    for source in (policy, f"policy:{policy}"):
-        with pytest.raises(SubterraError, match=f"version 1 is the benchmark; its task is {now}$"):
-            st.load_policy(source, *st.make("Subterra/StopAt-v1", tunnel="control"))
-
-
-def test_gymnasium_names_the_successor_of_a_task_that_is_gone():
+def test_gymnasium_names_the_id_of_a_version_that_is_gone():
     for id in ("Subterra/StopAt-v0", "Subterra/B2Traverse-v0"):
         with pytest.raises(gymnasium.error.DeprecatedEnv, match=id.replace("-v0", "-v1")):
             gymnasium.make(f"subterra_jax:{id}")
     with pytest.raises(gymnasium.error.NameNotFound, match="Did you mean"):
         gymnasium.make("subterra_jax:Subterra/StopAtOffset-v0")
-
-
-def test_a_policy_file_of_a_task_that_is_gone_names_the_successor(tmp_path):
-    for ending in (".safetensors", ".json"):
-        shutil.copy(packaged("policies") / f"TraverseShort-v1{ending}", tmp_path / f"mine{ending}")
-    facts = tmp_path / "mine.json"
-    facts.write_text(facts.read_text().replace("TraverseShort-v1", "TraverseShort-v0"))
-    with pytest.raises(PolicyError) as error:
-        read(tmp_path / "mine.safetensors")
-    assert str(error.value).endswith("trained for Subterra/TraverseShort-v0, which is gone; train for "
-                                     "Subterra/TraverseShort-v1")  # fmt: skip
 
 
 def test_an_id_that_never_was_lists_those_there_are():
