@@ -93,7 +93,6 @@ MISTAKES = {
     "benchmarks.fidelity controls --scene tunnel --only N999 --out o": "no control 'N999'",
     "benchmarks.fidelity controls --scene tunnel --processes 0 --out o": "processes must be at least 1",
     "benchmarks.fidelity sweep --scene tunnel --tolerances nan --out o": "tolerances must be positive, got nan",
-    "benchmarks.fidelity report --scene tunnel --out empty": "empty: holds no values.json",
     "benchmarks.fidelity windows --scene none --out o": "none: no such file or folder",
     "benchmarks.fidelity faults --scene tunnel --draw -1 --out o": "draw must not be negative",
     "benchmarks.fidelity faults --scene tunnel --kinds ghost --out o": "no size of 'ghost' is asked for",

@@ -25,9 +25,8 @@ from benchmarks.fidelity.candidate import load_candidate
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.derive.beams import cast_beams
 from benchmarks.fidelity.derive.surface import surface_caster
-from benchmarks.fidelity.figures.errors import draw_mismatch, draw_projections
-from benchmarks.fidelity.figures.sheet import BLUE, GREY, INK, Sheet
 from benchmarks.fidelity.references import HoldConfig, load_hold
+from benchmarks.fidelity.report.figures import BLUE, GREY, INK, Sheet, draw_mismatch, draw_projections
 from benchmarks.results import write_file
 from benchmarks.truth import scene_points
 from scene.poses.trajectory import Trajectory, load_tum
@@ -342,7 +341,7 @@ def _errors(material: Material, axes: Any) -> None:
 def _drawings(material: Material) -> dict[str, Callable[[], Drawn | None]]:
     """Returns what draws figures 1 to 3 by name; the third is that of a fidelity report."""
     report = {"seed": 0, "split": {"hold": {"file": SURVEY_FILES[2]}, "rule": "by sensor"}}
-    sheet = Sheet(material.case, material.case, report, [], [])
+    sheet = Sheet(material.case, report)
     return {
         "fig1": lambda: draw_bore_view(material),
         "fig2": lambda: draw_pipeline(material),

@@ -4,7 +4,6 @@ Example: python -m benchmarks.fidelity run --scene build/tunnel --recording held
 """
 
 import functools
-import math
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -16,7 +15,7 @@ import tyro
 from benchmarks.fidelity import judge, outside, scoring
 from benchmarks.fidelity.case import Case, case_hash
 from benchmarks.fidelity.faults import ladder
-from benchmarks.fidelity.faults.runner import Bench, Job, is_bold, is_ranked, judge_outcomes, list_jobs, run_jobs
+from benchmarks.fidelity.faults.runner import Bench, is_bold, is_ranked, judge_outcomes, list_jobs, run_jobs
 from benchmarks.fidelity.files import FidelityError, read_kept, write_json
 from benchmarks.fidelity.inputs import (
     FOREIGN,
@@ -37,7 +36,6 @@ from subterra_jax.host.files import require_folder
 
 CONTROLS_SCHEMA = "subterra.fidelity-controls/1"
 SWEEP_SCHEMA = "subterra.fidelity-sweep/1"
-MIDDLING = (("N02", 2.0), ("N25", 30.0))  # corruptions that the sweep makes where `controls` has not left them
 _PROG = "python -m benchmarks.fidelity"
 
 
@@ -63,7 +61,6 @@ class SweepConfig(Inputs):
     """Runs of the sweep that compute all geometry anew."""
 
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)  # Seeds of such runs; empty for none.
-    tolerances: tuple[float, ...] = (0.9, 1.1)  # Factors on the tolerances inside metrics; empty for none.
 
 
 @dataclass(frozen=True)
@@ -153,53 +150,33 @@ def _check_controls(config: ControlsConfig) -> None:
 
 
 def run_sweep(config: SweepConfig) -> None:
-    """Moves thresholds, tolerances and seeds, and says how far the scores follow.
+    """Moves thresholds and seeds, and says how far the scores follow.
 
     The results of `controls` in `--out` take part in the order that must be kept.
 
     Example: python -m benchmarks.fidelity sweep --seeds 0 1 2 --out out/fidelity
     """
-    for name, values, least in (("seeds", config.seeds, 0.0), ("tolerances", config.tolerances, 1e-6)):
-        for value in values:
-            if not least <= value < math.inf:
-                raise FidelityError(f"{name} must be {'positive' if least else 'at least 0'}, got {value}")
+    if wrong := [seed for seed in config.seeds if seed < 0]:
+        raise FidelityError(f"seeds must be at least 0, got {wrong[0]}")
     opened = open_case(config)
-    candidates = dict(opened.values)
-    foreign = config.out / FOREIGN
-    bench = Bench(opened.case, candidates["base"], config.out / "controls", foreign if foreign.exists() else None)
-    run_jobs(bench, [Job(*one) for one in MIDDLING], processes=1)
-    candidates |= {outcome.job.name: outcome.values for outcome in bench.kept() if is_ranked(outcome.job)}
-    rows = scoring.sweep_thresholds(candidates)
-    for kind, runs in _recompute(opened, config).items():
-        rows += scoring.compare_runs(kind, runs, candidates["base"])
+    base, foreign = opened.values["base"], config.out / FOREIGN
+    bench = Bench(opened.case, base, config.out / "controls", foreign if foreign.exists() else None)
+    candidates = opened.values | {one.job.name: one.values for one in bench.kept() if is_ranked(one.job)}
+    rows = scoring.sweep_thresholds(candidates) + scoring.compare_seeds(_other_seeds(opened, config.seeds), base)
     content = {"schema": SWEEP_SCHEMA, "key": case_hash(opened.case), "rows": rows,
                "summary": scoring.summarise(rows)}  # fmt: skip
     write_json(config.out / "sweep.json", content)
     _print_summary(_write_report(opened))
 
 
-def _recompute(opened: OpenCase, config: SweepConfig) -> dict[str, dict[str, dict[str, Value]]]:
-    """Return the values with other tolerances and seeds, by kind and run."""
-    base = opened.values["base"]
-    runs: dict[str, dict[str, dict[str, Value]]] = {"tolerance": {}, "seed": {}}
-    cases = [("tolerance", f"x{k}", replace(opened.case.fresh(), tolerance=k)) for k in config.tolerances]
-    cases += [("seed", str(seed), replace(opened.case.fresh(), seed=seed)) for seed in config.seeds]
-    for kind, name, fresh in cases:
-        same = kind == "seed" and fresh.seed == opened.case.seed
-        runs[kind][name] = base if same else evaluate(fresh, judge.geometry_categories(), base)
-        print(f"{kind} {name}: done", flush=True)
+def _other_seeds(opened: OpenCase, seeds: tuple[int, ...]) -> dict[str, dict[str, Value]]:
+    """Return the values with other seeds, by seed."""
+    base, runs = opened.values["base"], {}
+    for seed in seeds:
+        same, fresh = seed == opened.case.seed, replace(opened.case.fresh(), seed=seed)
+        runs[str(seed)] = base if same else evaluate(fresh, judge.geometry_categories(), base)
+        print(f"seed {seed}: done", flush=True)
     return runs
-
-
-def run_report(inputs: Inputs) -> None:
-    """Writes the report of what earlier commands left in `--out`.
-
-    Example: python -m benchmarks.fidelity report --out out/fidelity
-    """
-    resolved = complete_inputs(inputs)
-    if not (resolved.out / "values.json").exists():
-        raise FidelityError(f"{resolved.out}: holds no values.json; run the suite first")
-    _print_summary(_write_report(open_case(inputs)))
 
 
 def run_windows(inputs: Inputs) -> None:
@@ -233,9 +210,8 @@ def run_faults(config: FaultsConfig) -> None:
     )
     for one in ladder.write_ladder(config.out, rows):
         factor, unit = (1000.0, "mm") if one["kind"] == "gauge" else (100.0, "cm")
-        print(f"  {one['kind']} over {one['length']:g} m: {factor * one['size_95']:.2g} {unit} "
-              f"({factor * one['low']:.2g} to {factor * one['high']:.2g}); {factor * one['asked']:g} {unit} noticed at "
-              f"{one['noticed_at_asked']} of {one['places']}")  # fmt: skip
+        print(f"  {one['kind']} over {one['length']:g} m: {factor * one['size_95']:.2g} {unit}; "
+              f"{factor * one['asked']:g} {unit} noticed at {one['noticed_at_asked']} of {one['places']}")  # fmt: skip
 
 
 def run_split(config: SplitCommand) -> None:
@@ -279,8 +255,7 @@ def main() -> int:
         sys.argv.append("run")
     actions: dict[str, Callable[[Any], None]] = {
         "run": run, "controls": run_controls, "sweep": run_sweep,
-        "split": run_split, "report": run_report,
-        "windows": run_windows, "faults": run_faults,
+        "split": run_split, "windows": run_windows, "faults": run_faults,
     }  # fmt: skip
     commands = {name: _without_prefix(action) for name, action in actions.items()}
 

@@ -1,4 +1,4 @@
-"""A candidate with its references, seed and tolerance; results kept once per case, recording or truth; hashes."""
+"""A candidate with its references and seed; results kept once per case, recording or truth; hashes."""
 
 import ctypes
 import gc
@@ -33,7 +33,6 @@ class Case:
     fit: Hold | None = None
     truth: Truth | None = None  # Truth of the generator; `None` for real data
     seed: int = 0  # Seed of sampling, noise and bootstrap
-    tolerance: float = 1.0  # Factor on the tolerances inside metrics, for the sweep
     cache: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)  # Results of `derive` for this case
 
     def has(self, need: table.Need | None) -> bool:
@@ -92,12 +91,12 @@ def per_case(function: Function) -> Function:
 
 
 def per_hold(function: Function) -> Function:
-    """Keeps the result of a function of recording, seed and tolerance once for all candidates."""
+    """Keeps the result of a function of recording and seed once for all candidates."""
     return kept_in(function, lambda case, *_: _reference_cache(case, case.hold))
 
 
 def per_truth(function: Function) -> Function:
-    """Keeps the result of a function of truth, seed and tolerance once for all candidates."""
+    """Keeps the result of a function of truth and seed once for all candidates."""
     return kept_in(function, lambda case, *_: _reference_cache(case, case.truth))
 
 
@@ -127,7 +126,7 @@ def kept_in(function: Function, place: Callable[..., tuple[dict[Any, Any], tuple
 
 def _reference_cache(case: Case, reference: Hold | Truth | None) -> tuple[dict[Any, Any], tuple[Any, ...]]:
     assert reference is not None
-    return reference.cache, (case.seed, case.tolerance)
+    return reference.cache, (case.seed,)
 
 
 @run_once
@@ -140,8 +139,8 @@ def code_hash() -> str:
 
 
 def case_hash(case: Case) -> str:
-    """Return the SHA-256 of candidate, references, seed, tolerance and code."""
-    digest = sha256(f"{code_hash()} {case.seed} {case.tolerance}".encode())
+    """Return the SHA-256 of candidate, references, seed and code."""
+    digest = sha256(f"{code_hash()} {case.seed}".encode())
     digest.update(candidate_hash(case.candidate).encode())
     for hold in (case.hold, case.fit):
         digest.update(b"none" if hold is None else f"{hold.hash} {len(hold.range)}".encode())

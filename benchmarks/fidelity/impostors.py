@@ -16,12 +16,7 @@ NULL_STEP = 0.5  # m between rings
 
 
 def null_tube(candidate: Candidate, sleepers: bool = True) -> Candidate:
-    """Return a candidate with the axis of the given one and its median section everywhere.
-
-    Args:
-        candidate: Candidate with the axis, median radius and track to use.
-        sleepers: Keep the track.
-    """
+    """Return a candidate with the axis of the given one and its median section everywhere."""
     bore = candidate.bore
     count = max(round(candidate.length / NULL_STEP), 2) + 1
     station = np.linspace(bore.station[0], bore.station[-1], count)
@@ -97,12 +92,7 @@ _POCKET = np.dtype(
 
 
 def truth_candidate(truth: Truth, base: Candidate) -> Candidate:
-    """Return the true surface as a candidate; its compiled scene stays the base's.
-
-    Args:
-        truth: Truth of the simulated survey.
-        base: Candidate whose scene folder and names are kept.
-    """
+    """Return the true surface as a candidate; its compiled scene stays the base's."""
     wall = _true_mesh(truth, *WALL_PARTS)
     wall.merge_vertices(digits_vertex=6)
     return replace(

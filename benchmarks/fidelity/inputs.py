@@ -203,11 +203,6 @@ def part_at(time: float, dealt: Int[np.ndarray, " b"], config: SplitConfig) -> i
 def split_recording(recording: Path, out: Path, config: SplitConfig) -> dict[str, Any]:
     """Writes `fit.bag`, `val.bag` and `hold.bag` with the messages as they were recorded, and `split.json`.
 
-    Args:
-        recording: A ROS1 bag, a ROS2 bag or an MCAP file.
-        out: Folder to write, whole or not at all.
-        config: The rule.
-
     Raises:
         FidelityError: It is no bag, or too short to give every part a block.
     """
@@ -287,15 +282,7 @@ def check_length(candidate: Candidate, scene: Path) -> None:
 
 
 def check_recording(candidate: Candidate, hold: Hold, scene: Path, recording: Path, partial: bool = False) -> None:
-    """Refuses a recording in another frame, or one that shows only a part of the tunnel.
-
-    Args:
-        candidate: Scene to be judged.
-        hold: Recording in the tunnel frame.
-        scene: Folder of the scene, for the sentence.
-        recording: File of the recording, for the sentence.
-        partial: Accept a recording of a part.
-    """
+    """Refuses a recording in another frame, or one that shows only a part of the tunnel."""
     line = Curve(candidate.bore.station, candidate.bore.position)
     first = np.unique(hold.scan, return_index=True)[1]
     local = line.local(hold.origin[first])

@@ -1,4 +1,4 @@
-"""The judgement of a case: values of reconstruction, null tubes and truth, and the verdict."""
+"""The judgement of a case: values of reconstruction, null tube and truth, and the verdict."""
 
 import gc
 import json
@@ -16,7 +16,7 @@ import numpy as np
 from benchmarks.fidelity import outside, scoring, table
 from benchmarks.fidelity.candidate import Candidate
 from benchmarks.fidelity.case import Case, case_hash, release_memory
-from benchmarks.fidelity.faults import rows as faults
+from benchmarks.fidelity.faults import kinds as faults
 from benchmarks.fidelity.files import read_kept, write_json
 from benchmarks.fidelity.impostors import null_tube, truth_candidate
 from benchmarks.fidelity.leaks import MEDIAN_FLOOR, NOISE_BAND, find_leaks
@@ -30,8 +30,6 @@ from scene.progress import Stages
 VALUES_SCHEMA = "subterra.fidelity-values/1"
 WINDOWS_SCHEMA = "subterra.fidelity-windows/1"
 
-WITHOUT_TRACK = ("SEC", "MSH", "TRI")  # categories that read nothing of the track
-
 NOT_COMPUTED = missing("taken from another candidate")  # in the categories in which both are the same
 
 Values = dict[str, Value]
@@ -41,7 +39,7 @@ Values = dict[str, Value]
 class Judgement:
     """The result of a run."""
 
-    values: dict[str, Values]  # Raw values of `base`, `null`, `null_bare`, and `ceiling` where there is a truth
+    values: dict[str, Values]  # Raw values of `base`, `null`, and `ceiling` where there is a truth
     scored: dict[str, Scored]  # Their scores
     skill: float | None  # Median skill over the null tube
     leaks: list[str]  # Findings of the leak detector
@@ -58,14 +56,7 @@ class Judgement:
 
 
 def judge_case(case: Case, folder: Path, strict: bool = False, processes: int = 1) -> Judgement:
-    """Computes values, windows, leaks and the verdict without the controls of `controls`.
-
-    Args:
-        case: Reconstruction and references.
-        folder: Folder that keeps what is done.
-        strict: Count metrics without a reference as 0.
-        processes: With 2 or more, half of the categories are computed in a second process.
-    """
+    """Computes values, windows, leaks and the verdict without the controls of `controls`."""
     with open_values(case, folder, processes) as values:
         leaks, windows = find_leaks(case, values["base"]), compute_windows(case, folder)
     return make_judgement(values, leaks, None, strict, windows)
@@ -83,7 +74,7 @@ def compute_windows(case: Case, folder: Path) -> Windows:
 
 
 def compute_values(case: Case, folder: Path, processes: int = 1) -> dict[str, Values]:
-    """Return the raw values of the reconstruction, its null tubes and the truth.
+    """Return the raw values of the reconstruction, its null tube and the truth.
 
     Each is kept in `values.json` when it is done, so that a run that was cut short goes on with the next.
     """
@@ -94,13 +85,10 @@ def compute_values(case: Case, folder: Path, processes: int = 1) -> dict[str, Va
 
 @contextmanager
 def open_values(case: Case, folder: Path, processes: int = 1) -> Iterator[dict[str, Values]]:
-    """Yields the values of the reconstruction; those of tubes and truth are there by the end of the block.
+    """Yields the values of the reconstruction; those of tube and truth are there by the end of the block.
 
-    Args:
-        case: Reconstruction and references.
-        folder: Folder for `values.json`.
-        processes: With 2 or more, a second process computes half of the categories of every candidate. So what is
-            derived from a reference serves all candidates, and is mostly derived in one of the processes alone.
+    With 2 or more processes, a second one computes half of the categories of every candidate. So what is derived from a
+    reference serves all candidates, and is mostly derived in one of the processes alone.
     """
     path, key = folder / "values.json", case_hash(case)
     values = {name: load_values(kept) for name, kept in read_kept(path, VALUES_SCHEMA, key).get("values", {}).items()}
@@ -118,9 +106,9 @@ def open_values(case: Case, folder: Path, processes: int = 1) -> Iterator[dict[s
                 return
             found, half = mine[name], theirs[name].result() if name in theirs else {}
             found |= {id: half[id] for id, row in table.load().items() if half and row.category in SECOND_HALF}
-            chosen, other = _what_differs(name)
+            chosen = _what_differs(name)
             values[name] = {
-                id: found[id] if row.category in chosen else values[other][id] for id, row in table.load().items()
+                id: found[id] if row.category in chosen else values["base"][id] for id, row in table.load().items()
             }
             dumped = {one: dump_values(values[one]) for one in make_candidates(case) if one in values}
             write_json(path, {"schema": VALUES_SCHEMA, "key": key, "values": dumped}, digits=17)
@@ -152,7 +140,7 @@ def _value_candidate(
 ) -> Values:
     """Return the values of a candidate in those of some categories in which it differs from another."""
     one = replace(case, candidate=make_candidates(case)[name](), cache={})
-    chosen = [category for category in _what_differs(name)[0] if category in categories]
+    chosen = [category for category in _what_differs(name) if category in categories]
     found = evaluate(one, chosen, dict.fromkeys(table.load(), NOT_COMPUTED), advance)
     one.cache.clear()
     release_memory()
@@ -176,20 +164,15 @@ def make_candidates(case: Case) -> dict[str, Callable[[], Candidate]]:
     makers: dict[str, Callable[[], Candidate]] = {
         "base": lambda: case.candidate,
         "null": lambda: null_tube(case.candidate),
-        "null_bare": lambda: null_tube(case.candidate, False),
     }
     if (truth := case.truth) is not None:
         makers["ceiling"] = lambda: truth_candidate(truth, case.candidate)
     return makers
 
 
-def _what_differs(name: str) -> tuple[tuple[str, ...], str]:
-    """Return the categories to compute for a candidate, and the candidate that the others are taken from."""
-    if name == "base":
-        return tuple(table.CATEGORIES), ""
-    if name == "null_bare":
-        return tuple(c for c in geometry_categories() if c not in WITHOUT_TRACK), "null"
-    return geometry_categories(), "base"
+def _what_differs(name: str) -> tuple[str, ...]:
+    """Return the categories to compute for a candidate; the others are those of the reconstruction."""
+    return tuple(table.CATEGORIES) if name == "base" else geometry_categories()
 
 
 def geometry_categories() -> tuple[str, ...]:

@@ -19,10 +19,7 @@ PATCH_SAMPLES = 8_000
 def find_leaks(case: Case, values: dict[str, Value], recorded: str | None = None) -> list[str]:
     """Return the findings against a clean split, in sentences; empty where there is none or nothing is held out.
 
-    Args:
-        case: Case with the held-out recording.
-        values: Its values; `c2m_median` is read.
-        recorded: SHA-256 of the file that was held out, to which the scored points must lead back.
+    The scored points must lead back to the file that was held out, whose SHA-256 is `recorded`.
     """
     if case.hold is None:
         return []

@@ -64,13 +64,7 @@ def files() -> dict[str, str]:
 def compute_values(
     case: Case, candidates: dict[str, Callable[[], Candidate]], folder: Path
 ) -> dict[str, dict[str, Value]]:
-    """Return the values of all metrics from outside, by candidate and id; they are kept in `outside.json`.
-
-    Args:
-        case: Case of the reconstruction.
-        candidates: Makers of the candidates by name.
-        folder: Folder for `outside.json`.
-    """
+    """Return the values of all metrics from outside, by candidate and id; they are kept in `outside.json`."""
     rows = metrics()
     if not rows:
         return {}

@@ -152,11 +152,7 @@ def evaluate(
 ) -> dict[str, Value]:
     """Return the raw values of the suite by id, in the order of the table.
 
-    Args:
-        case: Candidate and references.
-        categories: Categories to compute; the others come from `reuse`.
-        reuse: Values of a case that differs in nothing that the other categories read.
-        advance: Function called with each id that is done.
+    Categories that are not asked for come from `reuse`, values of a case that differs in nothing that they read.
     """
     values: dict[str, Value] = {}
     last = ""

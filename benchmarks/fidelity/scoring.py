@@ -1,4 +1,4 @@
-"""Scores, categories, the global figure and the verdict; and how far they depend on thresholds, tolerances and seed."""
+"""Scores, categories, the global figure and the verdict; and how far they depend on thresholds and seed."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -155,7 +155,7 @@ def reasons_against(
     return reasons + [f"leak: {leak}" for leak in leaks]
 
 
-# The sweep: other thresholds, tolerances and seeds.
+# The sweep: other thresholds and seeds.
 
 
 def threshold_maps(seed: int = 0) -> Iterator[tuple[str, str, Maps]]:
@@ -187,17 +187,17 @@ def sweep_thresholds(candidates: dict[str, Values]) -> list[dict[str, Any]]:
     ]
 
 
-def compare_runs(kind: str, runs: dict[str, Values], base: Values) -> list[dict[str, Any]]:
-    """Return the rows of runs that computed the reconstruction anew, with other tolerances or seeds."""
+def compare_seeds(runs: dict[str, Values], base: Values) -> list[dict[str, Any]]:
+    """Return the rows of runs that computed the reconstruction anew with other seeds."""
     before = {"base": score_all(base)}
-    return [_sweep_row(kind, name, before, {"base": score_all(values)}) for name, values in runs.items()]
+    return [_sweep_row("seed", name, before, {"base": score_all(values)}) for name, values in runs.items()]
 
 
 def summarise(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Return the largest moves by kind, and whether each keeps its limit; `sweepable` scored metrics move at all."""
     maps = [row.map for row in table.load().values() if row.scored]
     kinds: dict[str, Any] = {"sweepable": float(np.mean([map.scaled(1.1) != map for map in maps]))}
-    for kind in ("common", "category", "independent", "tolerance", "seed"):
+    for kind in ("common", "category", "independent", "seed"):
         own = [row for row in rows if row["kind"] == kind]
         if not own:
             continue

@@ -1,6 +1,8 @@
 """One survey from beginning to end: draw the bore, walk through it, write a bag for each device."""
 
+import multiprocessing
 from collections.abc import Callable, Iterable
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
@@ -116,6 +118,7 @@ def write_recording(
 
 
 TRUTH_RATE = 200.0  # Hz, rows of groundtruth.tum
+_WORTH_A_PROCESS = 100.0  # m from which on every further device is simulated in a process of its own
 _BEHIND = {"avia": 20.0}  # m of bore that a LiDAR sees behind itself, where it is not its whole range
 
 
@@ -135,8 +138,16 @@ def simulate(config: SurveyConfig, console: Console) -> str:
     parts = [f"{config.out}: {config.length:g} m"]
     # A sensor's noise does not depend on which others are on the rack.
     seeds = dict(zip(LIDARS, of_sensors.spawn(len(LIDARS)), strict=True))
-    for name in config.sensors:
-        parts.append(_simulate_device(config, name, walk, mesh, seeds[name], console))
+    jobs = [(config, name, walk, mesh, seeds[name]) for name in config.sensors]
+    apart = jobs[1:] if config.length >= _WORTH_A_PROCESS else []
+    with ExitStack() as stack:
+        waiting = []
+        if apart:
+            pool = stack.enter_context(ProcessPoolExecutor(len(apart), multiprocessing.get_context("spawn")))
+            stack.callback(pool.shutdown, cancel_futures=True)
+            waiting = [pool.submit(_simulate_device, *job, Console(quiet=True)) for job in apart]
+        parts += [_simulate_device(*job, console) for job in jobs[: len(jobs) - len(apart)]]
+        parts += [one.result() for one in waiting]
     return ", ".join(parts)
 
 

@@ -337,7 +337,7 @@ def _through_mouth(case: Case, origin: np.ndarray, direction: np.ndarray, end: i
 def lasting_difference(case: Case, dimension: int) -> Value:
     """Difference in the number of lasting loops (1) or of bodies that float in the free space (2)."""
     diagrams = derived.candidate_diagrams(case)[dimension], derived.reference_diagrams(case)[dimension]
-    judged, real = (int(np.sum(d[:, 1] - d[:, 0] > _LASTING_PERSISTENCE * case.tolerance)) for d in diagrams)
+    judged, real = (int(np.sum(d[:, 1] - d[:, 0] > _LASTING_PERSISTENCE)) for d in diagrams)
     return number(abs(judged - real), judged + real)
 
 

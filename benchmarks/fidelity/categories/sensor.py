@@ -67,19 +67,19 @@ def beam_rel_medae(case: Case) -> Samples:
 @metric("beam_within_10cm", "BEA", U(0.85, 0.999754), needs="hold", of=np.mean)
 def beam_within_10cm(case: Case) -> Samples:
     """Share of the returns that the candidate gives within 10 cm; a beam that leaves it is not within."""
-    return _beam_share(case, np.abs(cast_beams(case).difference) <= 0.10 * case.tolerance)
+    return _beam_share(case, np.abs(cast_beams(case).difference) <= 0.10)
 
 
 @metric("beam_early_frac", "BEA", D(6.93e-05, 0.03), needs="hold", of=np.mean)
 def beam_early_frac(case: Case) -> Samples:
     """Share of the returns in front of which, by more than 20 cm, the candidate stands."""
-    return _beam_share(case, cast_beams(case).difference < -_FAR * case.tolerance)
+    return _beam_share(case, cast_beams(case).difference < -_FAR)
 
 
 @metric("beam_late_frac", "BEA", D(7.94e-05, 0.05), needs="hold", of=np.mean)
 def beam_late_frac(case: Case) -> Samples:
     """Share of the returns that the candidate gives more than 20 cm later, or not at all."""
-    return _beam_share(case, cast_beams(case).difference > _FAR * case.tolerance)
+    return _beam_share(case, cast_beams(case).difference > _FAR)
 
 
 def _beam_share(case: Case, marked: np.ndarray) -> Samples:
@@ -108,7 +108,7 @@ def selfcast_p2s_mean(case: Case) -> Value:
 @metric("selfcast_within_10cm", "BEA", LOGGED_UP, needs="hold", evidence="C")
 def selfcast_within_10cm(case: Case) -> Value:
     """The paper's headline: share of that cloud within 10 cm."""
-    near = self_cast(case).distance <= 0.10 * case.tolerance
+    near = self_cast(case).distance <= 0.10
     return number(float(np.mean(near)), len(near), _CIRCULAR)
 
 

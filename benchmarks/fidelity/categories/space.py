@@ -63,7 +63,7 @@ def occ2d_free_recall(case: Case) -> Samples:
 def occ2d_boundary_f1(case: Case) -> Value:
     """F1 of the edges of free space, matched within 10 cm."""
     judged, reference = (plane.edge_cells(free) for free in plane.gapless_maps(case)[:2])
-    edge, reach = plane.free_plane(case).lattice.edge, _EDGE_NEAR * case.tolerance + 1e-9
+    edge, reach = plane.free_plane(case).lattice.edge, _EDGE_NEAR + 1e-9
     precision = mean(plane.cell_distances(judged, reference, edge) <= reach)
     recall = mean(plane.cell_distances(reference, judged, edge) <= reach)
     return number(2 * precision * recall / max(precision + recall, 1e-12), int(judged.sum() + reference.sum()))
@@ -145,7 +145,7 @@ def free3d_volume_rel_err(case: Case) -> Value:
 @metric("free3d_false_free", "F3D", D(1e-06, 0.05), needs="hold", of=mean)
 def free3d_false_free(case: Case) -> Samples:
     """Share of held-out returns deeper than 20 cm in the candidate's air."""
-    points, deep = hold_points(case), _DEEP_RETURN * case.tolerance
+    points, deep = hold_points(case), _DEEP_RETURN
     inside = lining_radii(case).depth(points) > deep
     wrong = np.zeros(len(points))
     if inside.any():
@@ -212,7 +212,7 @@ def free3d_hold_poses_free(case: Case) -> Samples:
     station = curve.local(at)[:, 0]
     within = (station > curve.station[0]) & (station < curve.station[-1])
     at, station = at[within], station[within]
-    clear = surface_nearest(case).query(at)[0] >= _SENSOR_CLEARANCE * case.tolerance
+    clear = surface_nearest(case).query(at)[0] >= _SENSOR_CLEARANCE
     free = (lining_radii(case).depth(at) > 0) & clear
     return Samples(free.astype(float), station)
 

@@ -49,7 +49,7 @@ def mesh_distance(case: Case) -> Samples:
 def mesh_precision(case: Case, within: float) -> Samples:
     """Share of held-out points within a distance of the surface; at 10 cm the paper's figure on unseen points."""
     distances = mesh_distances(case)
-    near = (distances.distance <= within * case.tolerance).astype(float)
+    near = (distances.distance <= within).astype(float)
     return Samples(near, distances.station, BOOTSTRAP_SAMPLES)
 
 
@@ -105,7 +105,7 @@ def m3c2_signif_frac(case: Case) -> Samples:
 
 
 def _completeness(case: Case, within: float) -> np.ndarray:
-    return (cloud_distances(case).distance <= within * case.tolerance).astype(float)
+    return (cloud_distances(case).distance <= within).astype(float)
 
 
 @metric("comp_10cm", "CMP", U(0.86, 0.999836), needs="hold", of=np.mean, args=(0.10,))
@@ -121,7 +121,7 @@ def completeness(case: Case, within: float) -> Samples:
 @metric("fscore_20cm", "CMP", U(0.8, 0.999999), needs="hold", args=(0.20,))
 def fscore(case: Case, within: float) -> Value:
     """Harmonic mean of precision and completeness at a distance."""
-    precision = float(np.mean(mesh_distances(case).distance <= within * case.tolerance))
+    precision = float(np.mean(mesh_distances(case).distance <= within))
     recall = float(np.mean(_completeness(case, within)))
     return number(2.0 * precision * recall / max(precision + recall, 1e-12), len(cloud_distances(case).distance))
 
@@ -167,7 +167,7 @@ def extra_surface_frac(case: Case) -> Value:
 def missing_surface_frac(case: Case) -> Samples:
     """Share of held-out points with no surface within 20 cm."""
     distances = mesh_distances(case)
-    far = (distances.distance > _FAR * case.tolerance).astype(float)
+    far = (distances.distance > _FAR).astype(float)
     return Samples(far, distances.station, BOOTSTRAP_SAMPLES)
 
 

@@ -137,9 +137,7 @@ def local_at(case: Case, reach: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n
 def noisy_ranges(case: Case, draw: str) -> Float[np.ndarray, " n"]:
     """Return the ranges that the sensor would have measured in the candidate, m; `inf` where a beam leaves it.
 
-    Args:
-        case: Case with a held-out recording, whose data sheet gives the noise.
-        draw: Name of the draw; the same name gives the same noise.
+    The same name of a draw gives the same noise.
     """
     assert case.hold is not None
     noise = case.rng(f"range noise {draw}").standard_normal(len(cast_beams(case).range))

@@ -29,7 +29,6 @@ class Planes:
     normal: Float[np.ndarray, "n 3"]  # Normals, unit vectors
     residual: Float[np.ndarray, " n"]  # Distance of the point from its plane, freed of the plane's three parameters, m
     sigma: Float[np.ndarray, " n"]  # Standard deviation of the neighbours about it, m
-    planarity: Float[np.ndarray, " n"]  # (middle - smallest) / largest spread: near 0 for a line or a ball
 
 
 def fit_planes(cloud: Float[np.ndarray, "m 3"], tree: cKDTree, query: Float[np.ndarray, "n 3"]) -> Planes:
@@ -38,8 +37,7 @@ def fit_planes(cloud: Float[np.ndarray, "m 3"], tree: cKDTree, query: Float[np.n
     middle, spread, axes = _principal_axes(cloud, tree, query, count)
     freed = np.sqrt(count / max(count - 3, 1))
     residual = np.abs(np.einsum("ni,ni->n", query - middle, axes[:, :, 0])) * freed
-    planarity = (spread[:, 1] - spread[:, 0]) / np.maximum(spread[:, 2], 1e-9)
-    return Planes(query, axes[:, :, 0], residual, spread[:, 0] * freed, planarity)
+    return Planes(query, axes[:, :, 0], residual, spread[:, 0] * freed)
 
 
 def _principal_axes(
@@ -202,7 +200,7 @@ def spatial_consistency(key: Int[np.ndarray, "v 3"], distance: Float[np.ndarray,
 
 @per_hold
 def real_map(case: Case) -> VoxelMap:
-    return voxel_map(returns(case).local, MAP_VOXEL * case.tolerance)
+    return voxel_map(returns(case).local, MAP_VOXEL)
 
 
 @per_case
@@ -210,7 +208,7 @@ def map_distances(case: Case) -> tuple[Int[np.ndarray, "v 3"], Float[np.ndarray,
     """Return voxels and Wasserstein distances between held-out and synthetic map."""
     local = local_at(case, noisy_ranges(case, "first"))
     local = local[np.isfinite(local[:, 0])]
-    key, distance = voxel_wasserstein(real_map(case), voxel_map(local, MAP_VOXEL * case.tolerance))
+    key, distance = voxel_wasserstein(real_map(case), voxel_map(local, MAP_VOXEL))
     if not len(key):
         raise ValueError("held-out and synthetic map share no voxel")
     return key, distance
@@ -220,7 +218,7 @@ def map_distances(case: Case) -> tuple[Int[np.ndarray, "v 3"], Float[np.ndarray,
 def own_consistency(case: Case) -> float:
     """Return the spatial consistency score of the odd held-out points against the even ones."""
     local = returns(case).local
-    halves = [voxel_map(local[k::2], MAP_VOXEL * case.tolerance) for k in (0, 1)]
+    halves = [voxel_map(local[k::2], MAP_VOXEL) for k in (0, 1)]
     return spatial_consistency(*voxel_wasserstein(*halves))
 
 

@@ -63,9 +63,7 @@ class Probe:
 def probe_free(case: Case) -> Bool[np.ndarray, " k"]:
     """Return True where the probe touches nothing, at each station of the centreline."""
     bore, probe = case.candidate.bore, Probe(case)
-    station = np.arange(
-        bore.station[0] + _PROBE_SPACING, bore.station[-1] - _PROBE_SPACING, _PROBE_SPACING * case.tolerance
-    )
+    station = np.arange(bore.station[0] + _PROBE_SPACING, bore.station[-1] - _PROBE_SPACING, _PROBE_SPACING)
     middle = interpolate_rows(station, bore.station, bore.position)
     return np.array([probe.depth(place) >= 0.0 for place in middle])
 

@@ -28,7 +28,6 @@ class ScanInformation:
     weakest: Float[np.ndarray, "s 3"]  # Direction of the smallest of them
     # Smallest eigenvalue of the rotation block, arms in units of the scan's mean range
     rotation: Float[np.ndarray, " s"]
-    strong: Float[np.ndarray, " s"]  # Share of points whose normal lies within 60° of the axis
 
 
 @per_side
@@ -47,19 +46,16 @@ def information(case: Case, real: bool) -> ScanInformation:
 
 def _scan_information(
     arm: Float[np.ndarray, "n 3"], normal: Float[np.ndarray, "n 3"], axis: Float[np.ndarray, "3"]
-) -> tuple[float, np.ndarray, np.ndarray, float, float]:
+) -> tuple[float, np.ndarray, np.ndarray, float]:
     known = np.isfinite(normal[:, 0])
     arm, normal = arm[known], normal[known]
     if len(arm) < _FEWEST_POINTS:
-        return np.nan, np.full(3, np.nan), np.full(3, np.nan), np.nan, np.nan
+        return np.nan, np.full(3, np.nan), np.full(3, np.nan), np.nan
     values, vectors = np.linalg.eigh(normal.T @ normal / len(normal))
     turn = np.cross(arm / np.mean(np.linalg.norm(arm, axis=1)), normal)
     rotation = float(np.linalg.eigvalsh(turn.T @ turn / len(turn))[0])
-    along = np.square(normal @ axis)
-    return (
-        max(float(np.mean(along)), _EIGEN_FLOOR), np.maximum(values, _EIGEN_FLOOR), vectors[:, 0],
-        max(rotation, _EIGEN_FLOOR), float(np.mean(along > 0.25)),
-    )  # fmt: skip
+    along = max(float(np.mean(np.square(normal @ axis))), _EIGEN_FLOOR)
+    return along, np.maximum(values, _EIGEN_FLOOR), vectors[:, 0], max(rotation, _EIGEN_FLOOR)
 
 
 # Aliases: scans shifted along the tunnel, and scan-to-scan registration.

@@ -80,7 +80,7 @@ def cloud_distances(case: Case) -> CloudDistances:
     samples = samples[:: max(len(samples) // (4 * MOST_POINTS), 1)]
     if not len(hits) or not len(samples):
         raise ValueError("no held-out beam meets the candidate")
-    gap, _ = cKDTree(hits, balanced_tree=False).query(samples, distance_upper_bound=0.05 * case.tolerance)
+    gap, _ = cKDTree(hits, balanced_tree=False).query(samples, distance_upper_bound=0.05)
     samples = samples[np.isfinite(gap)]
     local = beams.sensor_path(case).local(samples)
     _, even = np.unique(
@@ -109,7 +109,7 @@ def phantom_cells(case: Case) -> Bool[np.ndarray, " c"]:
     _, cell = np.unique(
         surface.cell_numbers(beams.local_at(case, cast.range)[observed], _OBSERVED_CELL), return_inverse=True
     )
-    crossed = np.bincount(cell, cast.difference[observed] < -_EARLY * case.tolerance)
+    crossed = np.bincount(cell, cast.difference[observed] < -_EARLY)
     return crossed > 0.5 * np.bincount(cell)
 
 
@@ -125,7 +125,7 @@ def density_aware_chamfer(case: Case) -> float:
     Source: Wu et al. 2021, arXiv 2111.12702, eq. 6: ½ Σ over both of the mean of 1 - exp(-α d) / n, with n the
     number of points that share the nearest neighbour.
     """
-    edge, hit = _THIN * case.tolerance, beams.cast_beams(case).hit
+    edge, hit = _THIN, beams.cast_beams(case).hit
     clouds = [
         points[np.unique(surface.cell_numbers(points, edge), return_index=True)[1]]
         for points in (beams.returns(case).local, beams.local_at(case, beams.cast_beams(case).range)[hit])
@@ -189,7 +189,7 @@ def m3c2_distances(case: Case) -> M3C2Distances:
         corepoint_normals=flat.normal[pick],
         cyl_radius=M3C2_RADIUS,
         max_distance=M3C2_REACH,
-        registration_error=M3C2_REGISTRATION * case.tolerance,
+        registration_error=M3C2_REGISTRATION,
     )
     distance, uncertainty = m3c2.run()
     known = np.isfinite(distance)
@@ -257,7 +257,7 @@ class Occupied:
 @kept_until("OCC", per_case)
 def occupied_voxels(case: Case) -> Occupied:
     """Return the voxels of held-out and synthetic points, and the known voxels near them."""
-    edge = VOXEL_EDGE * case.tolerance
+    edge = VOXEL_EDGE
     real = beams.returns(case)
     clouds = [_count_points(real.local, edge)]
     for draw in ("first", "second"):
@@ -275,7 +275,7 @@ def free_voxels(case: Case) -> Int[np.ndarray, "n 3"]:
     """Return the indices of voxels that held-out beams passed in the last metres before their returns."""
     real = beams.returns(case)
     pick = np.linspace(0, len(real.range) - 1, min(len(real.range), _FREE_RAYS)).astype(int)
-    edge = VOXEL_EDGE * case.tolerance
+    edge = VOXEL_EDGE
     before = np.arange(edge, _FREE_LENGTH, _BEAM_STEP)
     steps = (real.local[pick] - back * real.heading[pick] for back in before)
     return np.unique(np.concatenate([_count_points(step, edge)[0] for step in steps]), axis=0)
@@ -316,12 +316,7 @@ def iou(a: Bool[np.ndarray, "..."], b: Bool[np.ndarray, "..."]) -> float:
 
 
 def tolerant_f1(grids: Occupied, group: Int[np.ndarray, " i"]) -> Float[np.ndarray, " g"]:
-    """Return F1 with a tolerance of one voxel for each group of slices; 0 where one of the surfaces is absent.
-
-    Args:
-        grids: Both surfaces.
-        group: Number of the group of each slice.
-    """
+    """Return F1 with a tolerance of one voxel for each group of slices; 0 where one of the surfaces is absent."""
     near = (grids.real & dilate(grids.first), grids.first & dilate(grids.real))
     counts = [np.bincount(group, grid.sum(axis=(1, 2))) for grid in (grids.real, grids.first, *near)]
     recall, precision = counts[2] / np.maximum(counts[0], 1), counts[3] / np.maximum(counts[1], 1)

@@ -112,7 +112,7 @@ class Air:
 
 @per_case
 def air_lattice(case: Case) -> Lattice:
-    return make_lattice(case, AIR_VOXEL * case.tolerance)
+    return make_lattice(case, AIR_VOXEL)
 
 
 def make_lattice(case: Case, edge: float) -> Lattice:

@@ -92,7 +92,7 @@ def ground_axes(curve: Curve, cell: float) -> tuple[Float[np.ndarray, " n"], Flo
 
 @kept_until("NAV", per_case)
 def judged_ground(case: Case) -> Ground:
-    return _cast_ground(ground_curve(case), GROUND_CELL * case.tolerance, surface_caster(case), lining_radii(case))
+    return _cast_ground(ground_curve(case), GROUND_CELL, surface_caster(case), lining_radii(case))
 
 
 def _cast_ground(curve: Curve, cell: float, caster: Caster, radii: Radii) -> Ground:
@@ -212,12 +212,12 @@ def both_grounds(case: Case) -> tuple[Ground, Ground]:
 
 def _observed_ground(case: Case) -> Ground:
     curve, points = reference_curve(case), synthetic_points(case)
-    return _ground_of_points(curve, GROUND_CELL * case.tolerance, curve.local(points[np.isfinite(points).all(axis=1)]))
+    return _ground_of_points(curve, GROUND_CELL, curve.local(points[np.isfinite(points).all(axis=1)]))
 
 
 @kept_until("NAV", per_reference)
 def _reference_ground(case: Case) -> Ground:
-    cell = GROUND_CELL * case.tolerance
+    cell = GROUND_CELL
     if case.truth is None:
         return _ground_of_points(hold_curve(case), cell, hold_local(case))
     return _cast_ground(ground_curve(case), cell, truth_caster(case), truth_radii(case))

@@ -330,5 +330,5 @@ def matched_pockets(case: Case) -> Int[np.ndarray, "k 2"]:
         return np.zeros((0, 2), int)
     apart, there = cKDTree(reference.place).query(judged.place)
     back = cKDTree(judged.place).query(reference.place)[1]
-    mutual = (back[there] == np.arange(len(judged))) & (apart <= POCKET_MATCH * case.tolerance)
+    mutual = (back[there] == np.arange(len(judged))) & (apart <= POCKET_MATCH)
     return np.column_stack([np.flatnonzero(mutual), there[mutual]])

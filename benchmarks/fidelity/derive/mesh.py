@@ -181,7 +181,7 @@ class Grid:
 
 def _make_grid(case: Case, curve: Curve, points: Float[np.ndarray, "k 3"]) -> Grid:
     """Return a grid that holds the points between the ends of a curve."""
-    cell = np.asarray(_GRID_CELL) * case.tolerance
+    cell = np.asarray(_GRID_CELL)
     across = np.abs(curve.local(points[::10])[:, 1:])
     half = np.percentile(across, 99.9, axis=0) + _GRID_PAD
     low = np.array([curve.station[0], *-half])

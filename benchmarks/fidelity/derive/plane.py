@@ -46,7 +46,7 @@ def sensor_height(case: Case) -> float:
 
 @per_case
 def free_plane(case: Case) -> Plane:
-    around, height = freespace.make_lattice(case, PLANE_CELL * case.tolerance), sensor_height(case)
+    around, height = freespace.make_lattice(case, PLANE_CELL), sensor_height(case)
     low = np.array([around.low[0], around.low[1], height - around.edge / 2])
     cells = freespace.Lattice(around.curve, low, (around.shape[0], around.shape[1], 1), around.edge)
     inside = (lining_radii(case).depth(cells.points()) > 0).reshape(cells.shape[:2])

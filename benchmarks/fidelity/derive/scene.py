@@ -17,12 +17,11 @@ import trimesh
 from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
-from benchmarks.fidelity.candidate import Track, track_of
+from benchmarks.fidelity.candidate import Geoms, Track, load_model, track_of
 from benchmarks.fidelity.case import SHARED, Case, Function, kept_in, per_case
 from benchmarks.fidelity.derive.curve import candidate_curve, interpolate_rows
 from benchmarks.fidelity.derive.mesh import face_parts
 from benchmarks.fidelity.derive.surface import Caster, surface_caster, visible_bodies
-from benchmarks.fidelity.geoms import Geoms, load_model
 from benchmarks.fidelity.meshes import concatenate_meshes, connected_groups
 from subterra_jax.host.tunnelfile import read_fields
 
@@ -36,7 +35,7 @@ def per_release(*reads: str) -> Callable[[Function], Function]:
     """
 
     def place(case: Case) -> tuple[dict[Any, Any], tuple[Any, ...]]:
-        return SHARED, (case.seed, case.tolerance, tuple(_HASHES[name](case) for name in reads))
+        return SHARED, (case.seed, tuple(_HASHES[name](case) for name in reads))
 
     return lambda function: kept_in(function, place)
 

@@ -17,7 +17,7 @@ from scipy.stats import spearmanr
 from benchmarks.fidelity import judge, outside, scoring, table
 from benchmarks.fidelity.candidate import Candidate, load_candidate
 from benchmarks.fidelity.case import Case, candidate_hash, case_hash, release_memory
-from benchmarks.fidelity.faults import Site, put_in, rows
+from benchmarks.fidelity.faults import Site, kinds, put_in
 from benchmarks.fidelity.files import read_kept, write_json
 from benchmarks.fidelity.judge import Judgement
 from benchmarks.fidelity.leaks import find_leaks
@@ -73,7 +73,7 @@ class Bench:
     def key(self, job: Job) -> str:
         """Return the SHA-256 of base, code and, for N33, the foreign scene: a kept result of others is not read."""
         other = "" if self.foreign is None or job.control != "N33" else candidate_hash(_foreign_candidate(self))
-        if rows.load_controls()[job.control].kind == "outside":
+        if kinds.load_controls()[job.control].kind == "outside":
             other = str(outside.files())
         return sha256(f"{self.own} {other}".encode()).hexdigest()
 
@@ -89,13 +89,13 @@ class Bench:
 
 def list_jobs(only: tuple[str, ...] = (), foreign: bool = True) -> list[Job]:
     """Return every control at every dose; N33 only where a foreign tunnel is at hand."""
-    every = [Job(control.id, dose) for control in rows.load_controls().values() for dose in control.faults]
+    every = [Job(control.id, dose) for control in kinds.load_controls().values() for dose in control.faults]
     return [job for job in every if (foreign or job.control != "N33") and (not only or job.control in only)]
 
 
 def is_bold(job: Job) -> bool:
     """Return True for a dose that must be noticed; invariances always count."""
-    return job.dose in rows.load_controls()[job.control].bold
+    return job.dose in kinds.load_controls()[job.control].bold
 
 
 def run_jobs(bench: Bench, jobs: list[Job], processes: int = 2) -> list[Outcome]:
@@ -119,7 +119,7 @@ def run_jobs(bench: Bench, jobs: list[Job], processes: int = 2) -> list[Outcome]
 
 def run_control(bench: Bench, job: Job) -> Outcome:
     rng = np.random.default_rng(np.random.SeedSequence(bench.case.seed, spawn_key=tuple(job.control.encode())))
-    control = rows.load_controls()[job.control]
+    control = kinds.load_controls()[job.control]
     with tempfile.TemporaryDirectory() as scratch:
         site = Site(replace(bench.case, cache={}), rng, Path(scratch), partial(_foreign_candidate, bench))
         spoiled = put_in(site, control.faults[job.dose])
@@ -136,7 +136,7 @@ def without_figures(reasons: list[str]) -> set[str]:
 def _evaluated_categories(evaluated: str) -> tuple[str, ...] | None:
     if evaluated == "all":
         return None
-    if evaluated == rows.OUT_OF_SCENE:
+    if evaluated == kinds.OUT_OF_SCENE:
         return tuple(name for name in table.CATEGORIES if name not in ("SCN", "PAR"))
     return tuple(evaluated.split())
 
@@ -185,7 +185,7 @@ def judge_outcomes(outcomes: list[Outcome], base: Judgement) -> list[dict[str, A
     judged = [_outcome_row(outcome, base) for outcome in outcomes]
     for row in judged:
         same = [other for other in judged if other["id"] == row["id"]]
-        row["spearman"] = _spearman(same, rows.load_controls()[row["id"]], base)
+        row["spearman"] = _spearman(same, kinds.load_controls()[row["id"]], base)
     return judged
 
 
@@ -205,35 +205,35 @@ def _outcome_row(outcome: Outcome, base: Judgement) -> dict[str, Any]:
         "categories": scored.categories, "base": base.scored["base"].overall,
         "capped": sorted({table.load()[id].category for id in gates}),
     }  # fmt: skip
-    control = rows.load_controls()[outcome.job.control]
+    control = kinds.load_controls()[outcome.job.control]
     named = {"kind": control.kind, "corruption": control.corruption, "evaluated": control.evaluated}
     return row | named | (_negative_row(row, control) if control.limit is None else _invariance_row(row, control))
 
 
-def _negative_row(row: dict[str, Any], control: rows.Control) -> dict[str, Any]:
+def _negative_row(row: dict[str, Any], control: kinds.Control) -> dict[str, Any]:
     bold = row["dose"] in control.bold
     short = {
         c: (row["falls"][c], asked) for c, asked in control.falls.items()
         if (row["falls"][c] or 0.0) < asked and c not in row["capped"]
     }  # fmt: skip
-    moved = {c: row["falls"][c] for c in control.quiet if abs(row["falls"][c] or 0.0) > rows.QUIET_LIMIT}
+    moved = {c: row["falls"][c] for c in control.quiet if abs(row["falls"][c] or 0.0) > kinds.QUIET_LIMIT}
     detected = row["verdict"] == "FAIL" and not short
     return {"bold": bold, "short": short if bold else {}, "detected": detected, "quiet": not moved, "moved": moved}
 
 
-def _invariance_row(row: dict[str, Any], control: rows.Control) -> dict[str, Any]:
+def _invariance_row(row: dict[str, Any], control: kinds.Control) -> dict[str, Any]:
     assert control.limit is not None
     falls = {c: fall for c, fall in row["falls"].items() if c not in control.exempt and fall is not None}
     moved = {c: fall for c, fall in falls.items() if abs(fall) > control.limit}
     known = row["overall"] is not None and row["base"] is not None
-    limit = rows.GLOBAL_LIMIT if control.limit < rows.THINNED_LIMIT else rows.THINNED_LIMIT
+    limit = kinds.GLOBAL_LIMIT if control.limit < kinds.THINNED_LIMIT else kinds.THINNED_LIMIT
     quiet = not moved and known and (bool(control.exempt) or abs(row["overall"] - row["base"]) <= limit)
     return {"bold": True, "short": {}, "detected": False, "quiet": quiet, "moved": moved}
 
 
-def _spearman(same: list[dict[str, Any]], control: rows.Control, base: Judgement) -> float | None:
+def _spearman(same: list[dict[str, Any]], control: kinds.Control, base: Judgement) -> float | None:
     """Return the rank correlation of dose and mean score of the named categories; the reconstruction is dose 0."""
-    if len(same) < 2 or control.id in rows.UNORDERED or not control.falls:
+    if len(same) < 2 or control.id in kinds.UNORDERED or not control.falls:
         return None
     order = sorted(same, key=lambda row: list(control.faults).index(row["dose"]))
     before = [base.scored["base"].categories[c] or 0.0 for c in control.falls]
@@ -243,4 +243,4 @@ def _spearman(same: list[dict[str, Any]], control: rows.Control, base: Judgement
 
 def is_ranked(job: Job) -> bool:
     """Return True where an outcome has a place in the order: invariances change nothing, cheats no geometry."""
-    return bool(rows.load_controls()[job.control].falls)
+    return bool(kinds.load_controls()[job.control].falls)

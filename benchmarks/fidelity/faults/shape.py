@@ -11,8 +11,8 @@ from benchmarks.fidelity.candidate import Candidate
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.derive.curve import Curve
 from benchmarks.fidelity.faults import kinds
+from benchmarks.fidelity.faults.mesh import scale_scene
 from benchmarks.fidelity.faults.references import bend_recording
-from benchmarks.fidelity.faults.scene import scale_scene
 from benchmarks.fidelity.meshes import keep_bodies
 
 _CORE, _RIM = np.deg2rad(40.0), np.deg2rad(65.0)  # from the middle of a part of the section: fully moved, not moved

@@ -1,29 +1,26 @@
-"""The report as plain data, and all its forms: JSON, CSV, HTML, Markdown, JUnit, figures."""
+"""The report as plain data, and its forms: JSON, CSV, HTML, figures."""
 
+import base64
 import platform
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jinja2 import Environment, FileSystemLoader
 
 from benchmarks.fidelity import judge, outside, scoring, table
 from benchmarks.fidelity.case import Case, code_hash
-from benchmarks.fidelity.faults.rows import suite_controls
-from benchmarks.fidelity.figures import draw_all
-from benchmarks.fidelity.figures.sheet import Sheet
-from benchmarks.fidelity.files import write_json
-from benchmarks.fidelity.impostors import null_tube
+from benchmarks.fidelity.faults.kinds import suite_controls
+from benchmarks.fidelity.files import write_csv, write_json, write_text
 from benchmarks.fidelity.inputs import Inputs
 from benchmarks.fidelity.judge import Judgement
 from benchmarks.fidelity.registry import BLOCK, Value
-from benchmarks.fidelity.report import forms
+from benchmarks.fidelity.report.figures import Sheet, draw_all
 from benchmarks.fidelity.scoring import Score, Scored
 from benchmarks.fidelity.table import Metric
 from benchmarks.fidelity.windows.judge import dump_windows
 from benchmarks.results import commit, version
-
-SOURCE = "Subterra: An Open-Source Validated Benchmark for GNSS-Denied Tunnel Navigation"
 
 
 def paper_rows(judgement: Judgement, controls: list[dict[str, Any]] | None = None) -> list[dict[str, Any]]:
@@ -72,15 +69,7 @@ def report_content(
     controls: list[dict[str, Any]] | None = None,
     sweep: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Return the content of `report.json`.
-
-    Args:
-        case: Candidate and references.
-        inputs: Inputs as the command resolved them.
-        judgement: Judgement of the case.
-        controls: Rows of `judge_outcomes` where controls were run.
-        sweep: Summary of the sweep where it was run.
-    """
+    """Return the content of `report.json`."""
     scored, null = judgement.scored["base"], judgement.scored["null"]
     worst = min((v, c) for c, v in scored.categories.items() if v is not None) if scored.evaluated else (None, None)
     rows = controls or []
@@ -223,26 +212,99 @@ def write_report(
     controls: list[dict[str, Any]] | None,
     swept: dict[str, Any] | None,
 ) -> dict[str, Any]:
-    """Writes every form of the report and returns its content.
-
-    Args:
-        folder: Folder to write to.
-        case: Candidate and references.
-        inputs: Inputs as the command resolved them.
-        judgement: Judgement of the case.
-        controls: Rows of controls where they were run.
-        swept: Content of `sweep.json` where the sweep was run.
-    """
+    """Writes every form of the report and returns its content."""
     content = report_content(case, inputs, judgement, controls, swept["summary"] if swept else None)
     rows = controls or []
     write_json(folder / "report.json", content)
-    forms.write_metrics(folder, content)
-    forms.write_categories(folder, content)
-    forms.write_controls(folder, rows)
-    forms.write_sweep(folder, swept["rows"] if swept else [])
-    forms.write_junit(folder, content)
-    null = replace(case, candidate=null_tube(case.candidate), cache={})
-    figures = draw_all(folder / "figures", Sheet(case, null, content, rows, swept["rows"] if swept else []))
-    forms.write_markdown(folder, content)
-    forms.write_html(folder, content, figures, rows)
+    write_metrics(folder, content)
+    write_categories(folder, content)
+    write_controls(folder, rows)
+    write_sweep(folder, swept["rows"] if swept else [])
+    figures = draw_all(folder / "figures", Sheet(case, content))
+    write_html(folder, content, figures, rows)
     return content
+
+
+# The forms: CSV files and HTML.
+
+HERE = Path(__file__).parent
+METRIC_COLUMNS = ("id", "category", "value", "unit", "score", "role", "evidence", "status", "ci_low", "ci_high", "n",
+                  "null_value", "ceiling_value", "skill", "map",
+                  "worst_start", "worst_value", "worst_score", "reason")  # fmt: skip
+
+
+def write_metrics(folder: Path, report: dict[str, Any]) -> Path:
+    """Writes `metrics.csv`: a row per metric of the suite.
+
+    Metrics from outside follow; the column `source`, which is there only then, names the suite or the file.
+    """
+    more = [] if report["outside"] is None else report["outside"]["metrics"]
+    rows = []
+    for entry in report["metrics"] + more:
+        low, high = entry["ci95"] or (None, None)
+        worst = {f"worst_{key}": value for key, value in (entry["worst_stretch"] or {}).items()}
+        rows.append({"source": "suite", **entry, "ci_low": low, "ci_high": high, **worst})
+    columns = METRIC_COLUMNS + (("source",) if more else ())
+    return write_csv(folder / "metrics.csv", columns, rows)
+
+
+def write_categories(folder: Path, report: dict[str, Any]) -> Path:
+    """Writes `categories.csv`: a row per category, with a column for the score with metrics from outside, if any."""
+    columns: tuple[str, ...] = ("category", "name", "score", "null", "ceiling")
+    rows = [{"category": id, **entry} for id, entry in report["categories"].items()]
+    if report["outside"] is not None:
+        columns += ("score_with_outside",)
+        for row in rows:
+            row["score_with_outside"] = report["outside"]["categories"].get(row["category"], row)["score"]
+    return write_csv(folder / "categories.csv", columns, rows)
+
+
+def write_controls(folder: Path, rows: list[dict[str, Any]]) -> Path:
+    flat = [
+        {
+            **row,
+            "quiet": "yes" if row["quiet"] else "no",
+            "detected": "" if row["kind"] == "invariance" else "yes" if row["detected"] else "no",
+            "short": _join_pairs({c: f"{(got or 0.0):.1f} of {asked:g}" for c, (got, asked) in row["short"].items()}),
+            "moved": _join_pairs({c: f"{fall:+.1f}" for c, fall in row["moved"].items() if fall is not None}),
+            "why": "; ".join(row["why"]),
+            **{f"fall_{c}": fall for c, fall in row["falls"].items()},
+        }
+        for row in rows
+    ]
+    columns = ("id", "kind", "corruption", "dose", "bold", "verdict", "detected", "quiet", "spearman", "overall",
+               "short", "moved", "evaluated", "why", *(f"fall_{c}" for c in table.CATEGORIES))  # fmt: skip
+    return write_csv(folder / "controls.csv", columns, flat)
+
+
+def write_sweep(folder: Path, rows: list[dict[str, Any]]) -> Path:
+    columns = ("kind", "run", "global", "delta", "category", "category_delta", "meets", "order_kept", "tau",
+               "saturated")  # fmt: skip
+    return write_csv(folder / "sweep.csv", columns, rows)
+
+
+def _join_pairs(entries: dict[str, str]) -> str:
+    return "; ".join(f"{name} {text}" for name, text in entries.items())
+
+
+def write_html(
+    folder: Path, report: dict[str, Any], figures: dict[str, tuple[Path, str]], controls: list[dict[str, Any]]
+) -> Path:
+    """Writes `report.html`, one file with everything in it."""
+    pictures = [
+        {"name": name, "caption": caption, "data": base64.b64encode(path.read_bytes()).decode()}
+        for name, (path, caption) in figures.items()
+    ]
+    environment = Environment(loader=FileSystemLoader(HERE), autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    environment.filters["figure"] = number_text
+    text = environment.get_template("report.html.j2").render(report=report, figures=pictures, controls=controls)
+    return write_text(folder / "report.html", text)
+
+
+def number_text(value: Any, digits: int = 4) -> str:
+    """Return a value for people; a dash for a missing one."""
+    if value is None:
+        return "\N{EN DASH}"
+    if isinstance(value, float):
+        return f"{value:.{digits}g}"
+    return str(value)

@@ -8,8 +8,7 @@ import numpy as np
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.derive.curve import candidate_curve
 from benchmarks.fidelity.faults import put_in
-from benchmarks.fidelity.faults.kinds import local_site
-from benchmarks.fidelity.faults.rows import stated_faults
+from benchmarks.fidelity.faults.kinds import local_site, stated_faults
 from benchmarks.fidelity.windows import measures
 
 
@@ -99,12 +98,7 @@ class Noticed:
 
 
 def notice_faults(case: Case, before: list[Worst]) -> list[Noticed]:
-    """Puts the stated faults into the candidate, one at a time, and says which windows notice them.
-
-    Args:
-        case: Case of the candidate as it is.
-        before: Its worst windows.
-    """
+    """Puts the stated faults into the candidate, one at a time, and says which windows notice them."""
     if not measures.sources(case):
         return []
     site, judged = local_site(case), {f"{one.id}.{one.source}" for one in before if one.value is not None}

@@ -148,10 +148,6 @@ def handedness(reference: Float[np.ndarray, "n m"], judged: Float[np.ndarray, "n
 
     1 where each side is where it belongs, -1 in a mirror. What a sideways shift of the middle does to both is taken
     out first. NaN where fewer than 50 cells are known on both sides.
-
-    Args:
-        reference: Radii of the reference by cell, m.
-        judged: Radii of the candidate about the same middle, m.
     """
     real, mine = _one_sided(reference), _one_sided(judged)
     known = np.isfinite(real) & np.isfinite(mine)

@@ -6,7 +6,7 @@ import pytest
 from benchmarks.fidelity import table
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.faults import Site, put_in
-from benchmarks.fidelity.faults.rows import load_controls
+from benchmarks.fidelity.faults.kinds import load_controls
 from benchmarks.fidelity.registry import compute_metric
 from tests.benchmarks.fidelity import tube
 

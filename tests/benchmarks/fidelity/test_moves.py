@@ -18,10 +18,8 @@ from benchmarks.fidelity import scoring, table
 from benchmarks.fidelity.candidate import Candidate
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.faults import Fault, Site, fault_kind, put_in
-from benchmarks.fidelity.faults.kinds import local_site
-from benchmarks.fidelity.faults.mesh import change_both
-from benchmarks.fidelity.faults.rows import load_controls
-from benchmarks.fidelity.faults.scene import copy_scene
+from benchmarks.fidelity.faults.kinds import load_controls, local_site
+from benchmarks.fidelity.faults.mesh import change_both, copy_scene
 from benchmarks.fidelity.inputs import Inputs, complete_inputs, read_case, run_module
 from benchmarks.fidelity.meshes import keep_bodies, without_faces
 from tests.benchmarks.fidelity.judged import measure

@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks.fidelity import judge, outside, table
 from benchmarks.fidelity.__main__ import main
-from benchmarks.fidelity.faults.rows import asked_faults
+from benchmarks.fidelity.faults.kinds import asked_faults
 from benchmarks.fidelity.faults.runner import Bench, Job, judge_outcomes, list_jobs, run_jobs
 from benchmarks.fidelity.registry import Samples, Value, number
 from benchmarks.fidelity.table import D, U, metric
@@ -67,7 +67,7 @@ def test_metrics_are_scored_beside_the_suite_and_leave_it_alone(tmp_path: Path) 
     case = tube.case(tube.Tube(length=6.0))
     suite = {id: Value(1.0 if row.map.kind == "P" else row.map.target if row.map.kind == "B" else row.map.good)
              for id, row in table.load().items()}  # fmt: skip
-    judged = judge.make_judgement({"base": suite, "null": suite, "null_bare": suite, "ceiling": suite}, [])
+    judged = judge.make_judgement({"base": suite, "null": suite, "ceiling": suite}, [])
     with_outside = judge.add_outside(judged, case, tmp_path)
     assert with_outside.scored is judged.scored
     assert with_outside.reasons == judged.reasons
@@ -83,7 +83,7 @@ def test_metrics_are_scored_beside_the_suite_and_leave_it_alone(tmp_path: Path) 
     scored = [row for row in table.load().values() if row.category == "LIN" and row.scored]
     assert base.categories["LIN"] == pytest.approx((100.0 * len(scored) + 50.0) / (len(scored) + 1))
     assert judged.scored["base"].categories["LIN"] == 100.0
-    assert len(calls) == 4  # reconstruction, two null tubes, truth
+    assert len(calls) == 3  # reconstruction, null tube, truth
     assert outside.metrics()["lin_given"].number == 200
     assert len(table.load_all()) == 203
     assert len(table.load()) == 199

@@ -10,7 +10,7 @@ from benchmarks.fidelity.candidate import Candidate
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.derive.surface import visible_mesh
 from benchmarks.fidelity.faults import KINDS, Site, put_in
-from benchmarks.fidelity.faults.rows import load_controls
+from benchmarks.fidelity.faults.kinds import load_controls
 from tests.benchmarks.fidelity import tube
 
 NO_SCENE = [id for id in load_controls() if id not in ("N01", "N12", "N29", "N30", "N31", "N33")]

@@ -8,8 +8,7 @@ import pytest
 from benchmarks.fidelity import judge
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.faults import Fault, put_in
-from benchmarks.fidelity.faults.kinds import local_site
-from benchmarks.fidelity.faults.rows import stated_faults
+from benchmarks.fidelity.faults.kinds import local_site, stated_faults
 from benchmarks.fidelity.registry import Value
 from benchmarks.fidelity.windows.deviation import COLUMNS, FINE, LEAST, TRACK, Relief, hold_frame, hold_map, parts_hit
 from benchmarks.fidelity.windows.judge import Noticed, Windows, Worst, dump_windows, load_windows, worst_windows
