@@ -33,16 +33,6 @@ def test_a_beam_meets_a_wall_where_geometry_says():
     assert face[4] == -1
 
 
-def test_coordinates_a_kilometre_off_move_no_range():
-    mesh, hold = judged().candidate.lining, judged().hold
-    far, moved = mesh.copy(), np.array([1000.3, -700.6, 12.1])
-    far.vertices = far.vertices + moved
-    here, _ = Caster(mesh).first(hold.origin, hold.direction)
-    there, _ = Caster(far).first(hold.origin + moved, hold.direction)
-    both = np.isfinite(here) & np.isfinite(there)
-    assert np.percentile(np.abs(here[both] - there[both]), 99.9) < 1e-4
-
-
 def test_an_obstacle_is_early_and_a_missing_end_is_late():
     assert raw("beam_early_frac", obstructed()) > 0.005
     assert raw("beam_late_frac", obstructed()) == 0.0

@@ -95,7 +95,8 @@ KNOWN = (
     (SHORT, HEARD | {"width": 6.2}, {"free2d_area_rel_err": above(8.0)}),
     (DEFAULT, {}, {
         "c2m_median": below(0.6745 * SIGMA), "c2m_signed_bias": below(0.001), "c2m_within_10cm": above(0.999),
-        "m3c2_signif_frac": below(0.01), "comp_10cm": above(0.99), "fscore_10cm": above(0.99),
+        "m3c2_signif_frac": below(0.01), "comp_10cm": above(0.99), "comp_20cm": above(0.99), "fscore_10cm": above(0.99),
+        "scs_diff": (0.0, inf),
         "extra_surface_frac": below(0.001), "missing_surface_frac": about(0.0), "range_ks": below(0.005),
         "range_w1": below(0.01), "incidence_w1": below(0.5), "c2st_auc": below(0.65),
         "vox_iou_norm": about(1.0, 0.02), "vox_iou_20cm": below(1.0), "vox_f1_tol1": above(0.999),
@@ -151,7 +152,7 @@ MOVES = (  # metrics, changes, and the factor and the addition that the value of
     ("c2m_mean", {"length": 14.0}, 10.0, 0.0),
     ("chamfer_l1", {"shift": (0.12, 0.0)}, 1.5, 0.0),
     ("dcd", {"shift": (0.12, 0.0)}, 1.0, 0.1),
-    ("fscore_10cm", {"shift": (0.12, 0.0)}, 1.0, -0.1),
+    ("fscore_5cm fscore_10cm", {"shift": (0.12, 0.0)}, 1.0, -0.1),
     ("range_ks range_w1 elevation_w1 azimuth_profile_rmse awd c2st_auc", WIDER, 1.5, 0.0),
     ("vox_iou_norm vox_precision vox_recall vox_kappa vox_proj_iou_yz", SHIFTED, 1.0, -0.1),
     ("vox_proj_iou_xy vox_proj_iou_xz", BIGGER, 1.0, -0.05),
