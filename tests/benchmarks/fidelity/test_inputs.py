@@ -1,15 +1,32 @@
-"""Mistakes of a user with the commands: one sentence, status 2, nothing half-written."""
+"""Mistakes of a user with the commands, recordings that do not fit, and the cut of a recording."""
 
+import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+from rosbags.rosbag1 import Reader
 
 from benchmarks.fidelity.__main__ import main
 from benchmarks.fidelity.candidate import load_candidate
 from benchmarks.fidelity.files import FidelityError
-from benchmarks.fidelity.inputs import Inputs, complete_inputs, with_sigma
+from benchmarks.fidelity.inputs import (
+    GUARD,
+    Inputs,
+    SplitConfig,
+    check_length,
+    check_recording,
+    complete_inputs,
+    deal_blocks,
+    part_at,
+    split_recording,
+    with_sigma,
+)
 from benchmarks.fidelity.references import HoldConfig
+from tests.benchmarks.fidelity import tube
+from tests.scene.bags import write_bag
 
 
 def test_a_recording_without_poses_is_refused(tmp_path: Path) -> None:
@@ -39,3 +56,101 @@ def test_a_mistake_at_the_command_line_ends_in_one_sentence_and_status_2(tmp_pat
     assert main() == 2
     assert capsys.readouterr().err.strip() == f"error: {tmp_path}: is no scene folder, scene.xml is missing"
     assert not (tmp_path / "o").exists()
+
+
+SCENE, BAG = Path("tunnel"), Path("held.bag")
+LONG = tube.Tube(length=48.0)
+
+
+def test_a_recording_of_the_whole_tunnel_in_its_frame_passes() -> None:
+    check_recording(tube.candidate(), tube.hold(tube.Tube(), beams=2000), SCENE, BAG)
+
+
+def test_a_recording_in_another_frame_is_refused() -> None:
+    hold = tube.hold(tube.Tube(), beams=2000)
+    away = replace(hold, origin=hold.origin + np.array([300.0, 40.0, 0.0]), cache={})
+    with pytest.raises(FidelityError, match=r"held.bag: its sensor lies 29\d m from the tunnel of tunnel"):
+        check_recording(tube.candidate(), away, SCENE, BAG)
+
+
+def test_a_recording_of_a_part_is_refused_unless_that_is_asked_for() -> None:
+    hold = tube.hold(LONG, beams=2000)
+    station = tube.candidate(LONG).bore.station
+    points = hold.origin + hold.range[:, None] * hold.direction
+    end = tube.candidate(LONG).bore.position[np.searchsorted(station, 24.0)]
+    ahead = tube.candidate(LONG).bore.tangent[0]
+    kept = ((points - end) @ ahead < 0.0) & ((hold.origin - end) @ ahead < 0.0)
+    names = ("time", "scan", "origin", "direction", "range")
+    half = replace(hold, **{name: getattr(hold, name)[kept] for name in names}, cache={})
+    with pytest.raises(FidelityError, match=r"held.bag: shows 2\d of the 48 m of tunnel, nothing for instance at stat"):
+        check_recording(tube.candidate(LONG), half, SCENE, BAG)
+    check_recording(tube.candidate(LONG), half, SCENE, BAG, partial=True)
+
+
+def test_a_tunnel_shorter_than_a_window_is_refused() -> None:
+    with pytest.raises(FidelityError, match=r"tunnel: its tunnel is 8\.0 m long, and a window along it 10 m"):
+        check_length(tube.candidate(tube.Tube(length=8.0)), SCENE)
+    check_length(tube.candidate(), SCENE)
+
+
+CONFIG = SplitConfig()
+
+
+def test_each_hand_of_five_blocks_holds_the_shares() -> None:
+    dealt = deal_blocks(100.0, CONFIG)
+    hands = dealt[: len(dealt) // 5 * 5].reshape(-1, 5)
+    assert {tuple(np.bincount(hand, minlength=3)) for hand in hands} == {(3, 1, 1)}
+
+
+def test_times_near_a_border_between_parts_belong_to_nobody() -> None:
+    dealt = np.array([0, 2, 2, 1, 0])
+    assert part_at(1.85, dealt, CONFIG) == 0
+    assert part_at(1.95, dealt, CONFIG) == GUARD
+    assert part_at(2.05, dealt, CONFIG) == GUARD
+    assert part_at(3.99, dealt, CONFIG) == 2
+
+
+def test_neighbouring_parts_are_a_guard_apart() -> None:
+    dealt = deal_blocks(60.0, CONFIG)
+    times = np.arange(0.0, 60.0, 0.01)
+    parts = np.array([part_at(t, dealt, CONFIG) for t in times])
+    kept = parts != GUARD
+    changes = np.flatnonzero(np.diff(parts[kept]) != 0)
+    assert np.diff(times[kept])[changes].min() >= CONFIG.guard - 0.011
+    assert np.bincount(parts[kept]) / kept.sum() == pytest.approx([0.6, 0.2, 0.2], abs=0.05)
+
+
+def test_a_bag_is_cut_into_parts_of_raw_messages(tmp_path: Path) -> None:
+    points = np.random.default_rng(0).normal(size=(4, 3))
+    source = write_bag(tmp_path / "whole.bag", [(100.0 + 0.25 * k, points + k) for k in range(200)])
+    facts = split_recording(source, tmp_path / "parts", CONFIG)
+    assert json.loads((tmp_path / "parts" / "split.json").read_text()) == json.loads(json.dumps(facts))
+    seen: dict[int, bytes] = {}
+    for name in ("fit", "val", "hold"):
+        rows = messages(tmp_path / "parts" / f"{name}.bag")
+        assert len(rows) == facts["messages"][name]
+        assert not set(rows) & set(seen)
+        seen |= rows
+    whole = messages(source)
+    assert all(whole[stamp] == raw for stamp, raw in seen.items())
+    assert len(whole) == len(seen) + facts["messages"]["guard"] == 200
+
+
+def messages(bag: Path) -> dict[int, bytes]:
+    with Reader(bag) as reader:
+        return {stamp: bytes(raw) for _, stamp, raw in reader.messages()}
+
+
+def test_what_is_no_bag_is_named_and_nothing_is_written(tmp_path: Path) -> None:
+    wrong = tmp_path / "wrong.bag"
+    wrong.write_text("no bag")
+    with pytest.raises(FidelityError, match=r"wrong\.bag: is no bag"):
+        split_recording(wrong, tmp_path / "parts", CONFIG)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["wrong.bag"]
+
+
+def test_a_recording_shorter_than_five_blocks_is_refused(tmp_path: Path) -> None:
+    short = write_bag(tmp_path / "short.bag", [(100.0 + k, np.ones((2, 3))) for k in range(5)])
+    with pytest.raises(FidelityError, match="shorter than five blocks"):
+        split_recording(short, tmp_path / "parts", CONFIG)
+    assert not (tmp_path / "parts").exists()

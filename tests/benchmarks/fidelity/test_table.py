@@ -1,4 +1,4 @@
-"""The table itself: how many, and what may be scored."""
+"""The table of metrics, and what a case keeps of its computations."""
 
 import math
 
@@ -6,9 +6,13 @@ import numpy as np
 import pytest
 
 from benchmarks.fidelity import table
+from benchmarks.fidelity.case import _KEPT_UNTIL
+from benchmarks.fidelity.derive.sections import truth_caster
+from benchmarks.fidelity.derive.surface import surface_nearest
 from benchmarks.fidelity.registry import dump_values, estimate, load_values, mean
 from benchmarks.fidelity.report import _worst_stretch
 from benchmarks.fidelity.table import B, D, Map, P, U
+from tests.benchmarks.fidelity import tube
 
 
 def test_there_are_18_categories_and_199_metrics_with_unique_ids() -> None:
@@ -74,3 +78,45 @@ def test_the_worst_stretch_of_a_metric_along_the_tunnel_is_kept_with_its_place()
     assert worst == {"start": 20.0, "end": 30.0, "value": pytest.approx(0.3), "score": 0.0}
     assert _worst_stretch(table.load()["cl_icp_translation"], found)["value"] == pytest.approx(0.3)
     assert estimate(mean, error[:3], station[:3], np.random.default_rng(0)).extremes is None
+
+
+POINTS = np.array([[1.0, 0.2, 0.1], [4.0, -0.3, 0.4]])
+
+
+def test_what_no_later_category_needs_is_let_go_and_comes_back_the_same() -> None:
+    case = tube.case().fresh()
+    before, of_truth = surface_nearest(case), truth_caster(case)
+    expected = before.query(POINTS)
+    case.forget("CEN")
+    assert surface_nearest(case) is before
+    case.forget("NAV")
+    assert surface_nearest(case) is not before
+    assert truth_caster(case) is not of_truth
+    for found, known in zip(surface_nearest(case).query(POINTS), expected, strict=True):
+        np.testing.assert_array_equal(found, known)
+
+
+def test_what_comes_back_after_its_category_goes_with_the_one_that_asked() -> None:
+    case = tube.case().fresh()
+    case.forget("F3D")
+    again = surface_nearest(case)
+    case.forget("CEN")
+    assert surface_nearest(case) is again
+    case.forget("SCN")
+    assert surface_nearest(case) is not again
+
+
+def test_every_mark_names_a_category() -> None:
+    table.load()
+    assert set(_KEPT_UNTIL.values()) <= set(table.CATEGORIES)
+
+
+def test_a_fresh_case_shares_data_and_no_results() -> None:
+    case = tube.case()
+    surface_nearest(case), truth_caster(case)
+    fresh = case.fresh()
+    assert fresh.candidate is case.candidate
+    assert fresh.hold.range is case.hold.range
+    assert not fresh.cache
+    assert not fresh.hold.cache
+    assert not fresh.truth.cache

@@ -1,3 +1,5 @@
+"""F2D, F3D and NAV: free space and the ways through it."""
+
 from dataclasses import replace
 from functools import partial
 
@@ -6,6 +8,7 @@ import pytest
 import trimesh
 
 from benchmarks.fidelity.derive import ground as grounds
+from benchmarks.fidelity.derive.freespace import air_voxels, clearance
 from benchmarks.fidelity.derive.ground import cell_steps, judged_ground, judged_route
 from tests.benchmarks.fidelity import tube
 from tests.benchmarks.fidelity.judged import SHORT, against, measure
@@ -13,6 +16,52 @@ from tests.benchmarks.fidelity.tube import Tube
 
 TUBE = SHORT
 judged = partial(against, SHORT)
+
+
+def test_a_pillar_is_not_free():
+    pillar = trimesh.creation.box((0.6, 0.6, 6.0))
+    pillar.apply_translation(TUBE.point(6.0, 1.5, 0.0)[0])
+    case = replace(judged(), candidate=replace(judged().candidate, extra=pillar), cache={})
+    lost = 1.0 - measure("occ2d_free_recall", case).value
+    assert lost == pytest.approx(0.6 * 0.6 / (5.6 * 12.0), rel=0.6)
+    assert measure("free2d_edt_rmse", case).value > 0.2
+
+
+def test_a_tube_that_is_not_there_breaks_with_a_reason():
+    far = replace(judged().candidate, lining=trimesh.Trimesh())
+    broken = measure("occ2d_free_iou", replace(judged(), candidate=far, cache={}))
+    assert broken.failed
+    assert broken.value is None
+    assert broken.reason.startswith(("ValueError: ", "IndexError: "))
+
+
+def with_extra(mesh):
+    return replace(judged(), candidate=replace(judged().candidate, extra=mesh), cache={})
+
+
+def wall(station):
+    """A wall across the whole bore."""
+    mesh = trimesh.creation.box((0.3, 8.0, 9.0))
+    turned = np.eye(4)
+    turned[:3, :3] = np.column_stack([axis[0] for axis in TUBE.frames(station)[1:]])
+    turned[:3, 3] = TUBE.point(station, 0.0, 0.0)[0]
+    return mesh.apply_transform(turned)
+
+
+def test_air_behind_a_wall_is_still_reached_from_the_other_mouth():
+    both = air_voxels(with_extra(wall(6.0)))
+    rows = both.judged.any(axis=(1, 2))
+    assert rows[:25].all()
+    assert rows[-25:].all()
+    assert not rows[30]
+
+
+def test_clearance_on_the_axis_is_half_the_width():
+    judged_clear, reference = clearance(judged())
+    assert reference.max() == pytest.approx(2.8, abs=0.25)
+    assert np.corrcoef(judged_clear.ravel(), reference.ravel())[0, 1] > 0.999
+
+
 STRAIGHT = Tube(length=6.0, bend=np.inf)
 
 

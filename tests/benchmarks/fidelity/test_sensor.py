@@ -1,0 +1,199 @@
+"""BEA, DIS and DEG: beams, distributions, degeneracy."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import cKDTree
+
+from benchmarks.fidelity import table
+from benchmarks.fidelity.case import Case
+from benchmarks.fidelity.categories import sensor
+from benchmarks.fidelity.categories.sensor import middle_range
+from benchmarks.fidelity.derive.beams import cast_beams
+from benchmarks.fidelity.derive.clouds import fit_planes, mean_entropy, voxel_map, voxel_wasserstein
+from benchmarks.fidelity.derive.degeneracy import alias_ratios, information, localised_stations
+from benchmarks.fidelity.derive.surface import Caster
+from benchmarks.fidelity.faults import Fault, Site, put_in
+from tests.benchmarks.fidelity import tube
+from tests.benchmarks.fidelity.judged import judged, measure, obstructed, raw
+
+SIGMA = 0.02
+
+
+def test_in_the_right_tube_nothing_but_the_range_noise_is_left():
+    assert raw("beam_range_mae", judged()) == pytest.approx(SIGMA * np.sqrt(2 / np.pi), rel=0.03)
+    assert raw("beam_range_medae", judged()) == pytest.approx(0.6745 * SIGMA, rel=0.03)
+    assert raw("beam_range_bias", judged()) < 4 * SIGMA / np.sqrt(len(cast_beams(judged()).range))
+    assert raw("beam_early_frac", judged()) == raw("beam_late_frac", judged()) == 0.0
+
+
+def test_a_beam_meets_a_wall_where_geometry_says():
+    straight = replace(tube.Tube(), bend=np.inf, grade=0.0, variation=0.0, depth=0.0, track=False)
+    eye = straight.point(9.0, 0.3, 0.0)
+    _, tangent, left, up = straight.frames([9.0])
+    caster = Caster(tube.candidate(straight).lining)
+    directions = np.concatenate([left, -left, -up, np.sqrt(0.5) * (left + tangent), tangent])
+    reach, face = caster.first(np.repeat(eye, 5, axis=0), directions)
+    np.testing.assert_allclose(reach[:4], [2.5, 3.1, 3.1, 2.5 * np.sqrt(2)], atol=1e-5)
+    assert np.isinf(reach[4])
+    assert face[4] == -1
+
+
+def test_an_obstacle_is_early_and_a_missing_end_is_late():
+    assert raw("beam_early_frac", obstructed()) > 0.005
+    assert raw("beam_late_frac", obstructed()) == 0.0
+    short = judged(length=14.0)
+    assert raw("beam_late_frac", short) == pytest.approx(np.mean(~cast_beams(short).hit), abs=0.01)
+    assert raw("beam_within_10cm", short) < 0.9
+
+
+def test_returns_are_foreseen_where_the_recording_knows_its_silent_beams():
+    assert measure("beam_return_bacc", judged()).value is None
+    hold = judged().hold
+    out = np.tile(tube.Tube().frames([0.0])[1], (300, 1)) * -1.0
+    eye = np.repeat(hold.origin[:1], 300, axis=0)
+    columns = {
+        "time": np.concatenate([hold.time, np.full(300, hold.time[0])]),
+        "scan": np.concatenate([hold.scan, np.zeros(300, int)]),
+        "origin": np.concatenate([hold.origin, eye]),
+        "direction": np.concatenate([hold.direction, out]),
+        "range": np.concatenate([hold.range, np.full(300, np.inf)]),
+    }
+    listening = replace(hold, **columns, knows_missing=True, cache={})
+    assert raw("beam_return_bacc", Case(judged().candidate, listening)) == pytest.approx(1.0, abs=1e-3)
+    walled = replace(judged().candidate, extra=_wall(0.0))
+    assert raw("beam_return_bacc", Case(walled, listening)) < 0.6
+    assert raw("dropout_diff", Case(walled, listening)) > raw("dropout_diff", Case(judged().candidate, listening))
+
+
+def _wall(station):
+    _, tangent, left, up = (axis[0] for axis in tube.Tube().frames([station]))
+    placement = np.eye(4)
+    placement[:3, :3] = np.column_stack([tangent, left, up])
+    placement[:3, 3] = tube.Tube().point(station, 0.0, 0.0)[0]
+    return trimesh.creation.box((0.1, 6.0, 7.0), transform=placement)
+
+
+def test_the_papers_own_figure_cannot_tell_a_wrong_tube_and_is_not_scored():
+    right, wrong = (raw("selfcast_p2s_mean", judged(**spoilt)) for spoilt in ({}, {"width": 6.2, "height": 7.0}))
+    assert wrong == pytest.approx(right, rel=0.1)
+    assert raw("selfcast_noise_ratio", judged(width=6.2)) == pytest.approx(1.0, abs=0.1)
+    assert not any(metric.scored for id, metric in table.load().items() if id.startswith("selfcast"))
+
+
+def test_a_moved_cloud_is_as_far_in_wasserstein_as_it_was_moved():
+    rng = np.random.default_rng(0)
+    cloud = rng.uniform(0.15, 0.35, (400, 3)) + np.repeat(0.5 * np.arange(4), 100)[:, None] * [1.0, 0.0, 0.0]
+    key, distance = voxel_wasserstein(voxel_map(cloud, 0.5), voxel_map(cloud + np.array([0.03, -0.04, 0.0]), 0.5))
+    assert len(key) == 4
+    np.testing.assert_allclose(distance, 0.05, atol=1e-6)
+
+
+def test_a_cloud_twice_as_rough_is_as_far_as_its_roughness():
+    rng = np.random.default_rng(1)
+    flat = rng.uniform(0.05, 0.45, (200_000, 3)) * [1.0, 1.0, 0.0]
+    noise = rng.normal(size=len(flat))[:, None] * [0.0, 0.0, 1.0]
+    smooth, rough = (voxel_map(flat + 0.25 * np.array([0, 0, 1.0]) + sigma * noise, 0.5) for sigma in (0.01, 0.03))
+    _, distance = voxel_wasserstein(smooth, rough)
+    np.testing.assert_allclose(distance, 0.02, atol=1e-4)
+
+
+def test_the_entropy_of_a_normal_cloud_is_its_formula():
+    rng = np.random.default_rng(2)
+    cloud = rng.normal(size=(4000, 3)) * [0.02, 0.03, 0.01]
+    expected = 0.5 * np.log((2 * np.pi * np.e) ** 3 * (0.02 * 0.03 * 0.01) ** 2)
+    assert mean_entropy(cKDTree(cloud), cloud[:200]) == pytest.approx(expected, abs=0.05)
+
+
+def test_a_local_plane_knows_its_normal_and_its_noise():
+    rng = np.random.default_rng(3)
+    cloud = np.column_stack([rng.uniform(-1, 1, (5000, 2)), 0.01 * rng.normal(size=5000)])
+    found = fit_planes(cloud, cKDTree(cloud), cloud[:2000])
+    assert np.median(np.abs(found.normal[:, 2])) > 0.99
+    assert np.median(found.sigma) == pytest.approx(0.01, rel=0.1)
+    assert np.median(found.residual) == pytest.approx(0.00674, rel=0.1)
+
+
+def test_the_middle_of_ranges_with_gaps_hardly_moves_with_half_of_the_beams():
+    rng = np.random.default_rng(4)
+    rings = np.repeat(4.0 * 1.2 ** np.arange(10), 100)  # m: where the rings of a scanner meet a bore
+    measured, cast = (rings + 0.03 * rng.normal(size=rings.size) for _ in range(2))
+    halves = [rng.random(rings.size) < 0.5 for _ in range(200)]
+
+    def spread(middle):
+        return np.std([middle(measured[half]) - middle(cast[half]) for half in halves])
+
+    assert middle_range(measured) == pytest.approx(np.median(rings), rel=0.05)
+    assert spread(middle_range) < 0.005
+    assert spread(middle_range) < 0.5 * spread(np.median)
+
+
+def test_half_of_the_beams_hardly_move_the_profile_over_azimuth():
+    case = judged()
+    half = put_in(Site(case, np.random.default_rng(5)), Fault("thinned", 0.5))
+    assert raw("azimuth_profile_rmse", half) == pytest.approx(raw("azimuth_profile_rmse", case), abs=0.003)
+
+
+def test_what_is_not_recorded_is_missing():
+    assert measure("dropout_diff", judged()).value is None
+    assert not measure("dropout_diff", judged()).failed
+
+
+SMOOTH = replace(tube.Tube(), bend=np.inf, grade=0.0, variation=0.0, depth=0.0, track=False)
+
+
+def test_a_straight_smooth_tube_tells_nothing_along_its_axis():
+    frames = information(tube.case(SMOOTH, sigma=1e-4, beams=2000), True)
+    assert np.median(frames.axial) < 1e-3
+    axis = SMOOTH.frames([9.0])[1][0]
+    assert np.median(np.abs(frames.weakest @ axis)) > 0.999
+    assert np.median(frames.translation.sum(axis=1)) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_sleepers_tell_the_axis():
+    bare, laid = (tube.case(replace(SMOOTH, track=laid), sigma=1e-3, beams=2000) for laid in (False, True))
+    assert np.median(information(laid, True).axial) > 5 * np.median(information(bare, True).axial)
+
+
+def test_a_scan_fits_as_well_elsewhere_in_a_smooth_tube_and_nowhere_else_in_a_wavy_one():
+    smooth, wavy = (tube.case(replace(SMOOTH, variation=v), sigma=1e-3, beams=2000) for v in (0.0, 0.05))
+    assert np.median(alias_ratios(smooth, True)) < 1.2
+    assert np.median(alias_ratios(wavy, True)) > 3.0
+
+
+def _planar(path, walls, lining="smooth"):
+    station = np.linspace(0.0, 20.0, 81)
+    centre = np.column_stack([station, np.zeros(81)])
+    polylines = {f"{side}_{lining}": wall for side, wall in zip(("left", "right"), walls, strict=True)}
+    np.savez(path, station=station, centre=centre, tangent=np.tile([1.0, 0.0], (81, 1)), **polylines)
+    return Case(replace(judged().candidate, tunnel=path))
+
+
+def test_a_planar_scan_is_lost_between_smooth_walls_and_found_between_pilasters(tmp_path):
+    straight = [np.array([[0.0, side], [20.0, side]]) for side in (2.5, -2.5)]
+    assert not localised_stations(_planar(tmp_path / "smooth.npz", straight)).any()
+    x = np.repeat(np.arange(0.0, 20.5, 1.0), 2)
+    step = np.tile([0.0, 0.5, 0.5, 0.0], len(x) // 4 + 1)[: len(x)]
+    stepped = [np.column_stack([x, side * (2.0 + step)]) for side in (1, -1)]
+    pilasters = _planar(tmp_path / "pockets.npz", stepped, "pockets")
+    assert localised_stations(pilasters).mean() > 0.5
+    assert raw("deg_planar_axial_info", pilasters) == localised_stations(pilasters).mean()
+
+
+def test_a_scan_near_the_cut_counts_by_the_probability_that_it_lies_beyond(monkeypatch):
+    """One standard deviation above and below the cut: 84 % and 16 % of a normal distribution."""
+    deviation, weakest = 0.05, np.full((20, 3), 1.0)  # of log10
+    scans = {real: SimpleNamespace(axial=np.full(20, 10.0 ** (sign * deviation) / 10.0), translation=weakest)
+             for real, sign in ((True, 1.0), (False, -1.0))}  # fmt: skip
+    monkeypatch.setattr(sensor.degeneracy, "information", lambda case, real: scans[real])
+    assert sensor.deg_landmark_diff(None).value == pytest.approx(100.0 * (0.8413 - 0.1587), abs=0.01)
+
+
+def test_half_of_the_beams_are_as_informed():
+    whole = tube.case(sigma=0.03, beams=8000)
+    half = put_in(Site(whole, np.random.default_rng(7)), Fault("thinned", 0.5))
+    full, thin = (np.median(information(case, True).axial) for case in (whole, half))
+    assert thin == pytest.approx(full, rel=0.1)
