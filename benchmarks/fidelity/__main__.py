@@ -105,7 +105,7 @@ def open_case(inputs: Inputs, processes: int = 1) -> OpenCase:
     require_folder(inputs.out)
     load_outside(inputs)
     resolved = complete_inputs(inputs)
-    case = read_case(resolved)
+    case = read_case(resolved, processes)
     judgement = judge.judge_case(case, resolved.out, resolved.strict, processes)
     return OpenCase(resolved, case, judgement, judgement.values)
 

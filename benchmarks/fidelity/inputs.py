@@ -1,9 +1,11 @@
 """Inputs of a command: scene, held-out recording and truth; and the cut of a recording into fit, val and hold."""
 
 import json
+import multiprocessing
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -77,8 +79,8 @@ def complete_inputs(inputs: Inputs) -> Inputs:
     return inputs
 
 
-def read_case(inputs: Inputs) -> Case:
-    """Reads the case of completed inputs.
+def read_case(inputs: Inputs, processes: int = 1) -> Case:
+    """Reads the case of completed inputs; with two processes or more the builder's recording is read beside the rest.
 
     Raises:
         FidelityError: A file is not what it should be.
@@ -87,19 +89,26 @@ def read_case(inputs: Inputs) -> Case:
     assert inputs.scene is not None
     candidate = load_candidate(inputs.scene)
     hold = fit = None
-    if inputs.recording is not None and inputs.trajectory is not None:
-        hold = load_hold(
-            inputs.recording, inputs.trajectory, candidate.origin, with_sigma(inputs.hold, inputs.recording)
-        )
-        check_recording(candidate, hold, inputs.scene, inputs.recording, inputs.partial)
     poses = inputs.fit_trajectory or inputs.trajectory
-    if inputs.fit_recording is not None and poses is not None:
-        fit = load_hold(inputs.fit_recording, poses, candidate.origin, inputs.hold)
-        if fit.hash not in [entry.get("sha256") for entry in candidate.manifest.get("inputs", [])]:
-            raise FidelityError(
-                f"{inputs.fit_recording}: is not what {inputs.scene} was built from; its manifest has another SHA-256"
-            )
-    truth = None if inputs.truth is None else load_truth(inputs.truth, candidate.origin)
+    with ExitStack() as stack:
+        fitted: Callable[[], Hold] | None = None
+        if inputs.fit_recording is not None and poses is not None:
+            fitted = partial(load_hold, inputs.fit_recording, poses, candidate.origin, inputs.hold)
+            if processes > 1:
+                pool = stack.enter_context(ProcessPoolExecutor(1, multiprocessing.get_context("spawn")))
+                fitted = pool.submit(fitted).result
+        if inputs.recording is not None and inputs.trajectory is not None:
+            noise = with_sigma(inputs.hold, inputs.recording)
+            hold = load_hold(inputs.recording, inputs.trajectory, candidate.origin, noise)
+            check_recording(candidate, hold, inputs.scene, inputs.recording, inputs.partial)
+        truth = None if inputs.truth is None else load_truth(inputs.truth, candidate.origin)
+        if fitted is not None:
+            fit = fitted()
+            if fit.hash not in [entry.get("sha256") for entry in candidate.manifest.get("inputs", [])]:
+                raise FidelityError(
+                    f"{inputs.fit_recording}: is not what {inputs.scene} was built from; "
+                    "its manifest has another SHA-256"
+                )
     case = Case(candidate, hold, fit, truth, inputs.seed)
     if case.has("reference"):
         check_length(candidate, inputs.scene)
