@@ -19,7 +19,6 @@ from benchmarks.fidelity import table
 from benchmarks.fidelity.candidate import Candidate
 from benchmarks.fidelity.references import Hold, Truth
 
-SHARED: dict[tuple[Any, ...], Any] = {}  # results from released files, for all cases of this process
 _KEPT_UNTIL: dict[tuple[str, str], str] = {}
 
 
@@ -56,7 +55,7 @@ class Case:
         """
         order = list(table.CATEGORIES)
         done = order[: order.index(category) + 1] if category in order else []
-        caches = [self.cache, SHARED, *(reference.cache for reference in (self.hold, self.truth) if reference)]
+        caches = [self.cache, *(reference.cache for reference in (self.hold, self.truth) if reference)]
         for results in caches:
             for key in [key for key in results if _KEPT_UNTIL.get(key[:2]) in done]:
                 del results[key]

@@ -9,14 +9,13 @@ from jaxtyping import Int
 from packaging.requirements import Requirement
 from scipy.spatial import cKDTree
 
-from benchmarks.fidelity.case import Case
+from benchmarks.fidelity.case import Case, per_case
 from benchmarks.fidelity.derive import contact, planar, track
 from benchmarks.fidelity.derive.scene import (
     LINING_NAMES,
     asset_files,
     count_assets,
     fastening_sets,
-    per_release,
     placed_data,
     rays_from_axis,
     robot_body,
@@ -195,7 +194,7 @@ def mj_step_finite(case: Case) -> Value:
     return pass_or_fail(bool(np.isfinite(state).all()) and warnings == 0, f"{warnings} warnings")
 
 
-@per_release("scene")
+@per_case
 def _push_robot(case: Case) -> tuple[np.ndarray, int, float]:
     """Return the last state, the number of warnings, and the steps per second."""
     model = scene_model(case)
@@ -261,7 +260,7 @@ def mj_frame_err(case: Case) -> Value:
     return number(_frame_error(case), len(case.candidate.lining.vertices))
 
 
-@per_release("scene", "mesh")
+@per_case
 def _frame_error(case: Case) -> float:
     lining = scene_geoms(case).named(*LINING_NAMES)
     if not lining:

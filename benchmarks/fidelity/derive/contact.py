@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Bool, Float
 
-from benchmarks.fidelity.case import Case, kept_until
+from benchmarks.fidelity.case import Case, kept_until, per_case
 from benchmarks.fidelity.derive import scene
 from benchmarks.fidelity.derive.curve import interpolate_rows
 from benchmarks.fidelity.derive.surface import surface_caster, surface_nearest
@@ -59,7 +59,7 @@ class Probe:
         return nearest
 
 
-@scene.per_release("scene", "mesh")
+@per_case
 def probe_free(case: Case) -> Bool[np.ndarray, " k"]:
     """Return True where the probe touches nothing, at each station of the centreline."""
     bore, probe = case.candidate.bore, Probe(case)
@@ -68,7 +68,7 @@ def probe_free(case: Case) -> Bool[np.ndarray, " k"]:
     return np.array([probe.depth(place) >= 0.0 for place in middle])
 
 
-@scene.per_release("scene", "mesh", "tunnel")
+@per_case
 def first_contacts(case: Case) -> tuple[list[Float[np.ndarray, " k"]], Float[np.ndarray, " k"]]:
     """Moves the probe from the middle to each wall at LiDAR height until it touches.
 
@@ -154,7 +154,7 @@ class Stepper:
         return self.data.replace(qpos=jax.numpy.asarray(qpos), qvel=jax.numpy.asarray(qvel))
 
 
-@kept_until("PAR", scene.per_release("scene"))
+@kept_until("PAR", per_case)
 def stepper(case: Case) -> Stepper:
     """Puts the scene on the device and compiles a step."""
     model = scene.scene_model(case)
@@ -164,14 +164,14 @@ def stepper(case: Case) -> Stepper:
     return Stepper(lambda state: step(device, state), model, data)
 
 
-@scene.per_release("scene")
+@per_case
 def step_is_finite(case: Case) -> bool:
     compiled = stepper(case)
     after = compiled.step(compiled.data)
     return bool(np.isfinite(np.asarray(after.qpos)).all() and np.isfinite(np.asarray(after.qvel)).all())
 
 
-@scene.per_release("scene", "tunnel", "mesh")
+@per_case
 def contact_depths(case: Case) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
     """Return the deepest contact of the robot at random places, by MuJoCo and by MJX, m; 0 without contact."""
     compiled = stepper(case)
@@ -215,7 +215,7 @@ def _robot_radius(model: mujoco.MjModel) -> float:
     return float(max(np.hypot(*model.geom_pos[k, :2]) + model.geom_size[k, 0] for k in own))
 
 
-@scene.per_release("scene")
+@per_case
 def path_divergence(case: Case) -> Float[np.ndarray, " k"]:
     """Return the distance between the robot's positions by MuJoCo and by MJX after each of 100 steps, m."""
     compiled = stepper(case)

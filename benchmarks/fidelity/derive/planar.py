@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 import subterra_jax as st
-from benchmarks.fidelity.case import Case
-from benchmarks.fidelity.derive.scene import lidar_elevation, per_release, random_stations, scene_model, scene_ranges
+from benchmarks.fidelity.case import Case, per_case
+from benchmarks.fidelity.derive.scene import lidar_elevation, random_stations, scene_model, scene_ranges
 from benchmarks.fidelity.derive.surface import surface_caster
 from subterra_jax import lidar
 from subterra_jax.parts import Noise, odometer
@@ -44,7 +44,7 @@ def make_environment(case: Case) -> tuple[st.TunnelEnv, EnvParams]:
     return st.make(TASK, tunnel=case.candidate.tunnel, lining=PLAN_LINING)
 
 
-@per_release("tunnel", "mesh")
+@per_case
 def lidar_poses(case: Case) -> LidarPoses:
     """Return random poses on both sides of the centreline, between ring stations, at random headings."""
     rng, params = case.rng("env_lidar_vs_mesh"), lidar.LidarParams()
@@ -61,7 +61,7 @@ def lidar_poses(case: Case) -> LidarPoses:
     return LidarPoses(station, place, heading, way / np.linalg.norm(way, axis=2, keepdims=True))
 
 
-@per_release("tunnel", "mesh")
+@per_case
 def lidar_ranges(case: Case) -> Float[np.ndarray, "k b"]:
     """Return the noise-free beams of `subterra_jax.lidar` at the poses, m."""
     at, params = lidar_poses(case), lidar.LidarParams()
@@ -70,7 +70,7 @@ def lidar_ranges(case: Case) -> Float[np.ndarray, "k b"]:
     return np.asarray(scan(*_plan_arrays(at)), float)
 
 
-@per_release("tunnel")
+@per_case
 def compile_observer(case: Case) -> Callable[[LidarPoses, jax.Array], np.ndarray]:
     """Return the function from poses and standard normal numbers to the ranges in the observations, m."""
     env, params = make_environment(case)
@@ -84,7 +84,7 @@ def compile_observer(case: Case) -> Callable[[LidarPoses, jax.Array], np.ndarray
     return lambda at, normal: np.asarray(compiled(*_plan_arrays(at), normal), float)
 
 
-@per_release("tunnel", "mesh")
+@per_case
 def observed_ranges(case: Case) -> Float[np.ndarray, "k b"]:
     """Return the ranges in the environment's observations at the poses, noise set to 0, m."""
     at = lidar_poses(case)
@@ -95,7 +95,7 @@ def _plan_arrays(at: LidarPoses) -> tuple[jax.Array, jax.Array, jax.Array]:
     return jnp.float32(at.position[:, :2]), jnp.float32(at.heading), jnp.float32(at.station)
 
 
-@per_release("tunnel", "mesh")
+@per_case
 def mesh_ranges(case: Case) -> Float[np.ndarray, "k b"]:
     """Return the ranges of rays in the meshes at the poses, m."""
     at = lidar_poses(case)
@@ -104,7 +104,7 @@ def mesh_ranges(case: Case) -> Float[np.ndarray, "k b"]:
     return at.ranges_in_plan(reach, float(lidar.LidarParams().range_max))
 
 
-@per_release("scene", "tunnel", "mesh")
+@per_case
 def mujoco_ranges(case: Case) -> Float[np.ndarray, "k b"]:
     """Return the ranges by `mj_multiRay` in the compiled scene at the poses, m."""
     at = lidar_poses(case)
@@ -112,7 +112,7 @@ def mujoco_ranges(case: Case) -> Float[np.ndarray, "k b"]:
     return at.ranges_in_plan(reach, float(lidar.LidarParams().range_max))
 
 
-@per_release("tunnel", "mesh")
+@per_case
 def range_noise(case: Case) -> Float[np.ndarray, " n"]:
     """Return noisy less noise-free ranges of the environment, of beams with a hit well within reach, m."""
     env, params = make_environment(case)
@@ -134,7 +134,7 @@ _ODOMETRY_LENGTH = 100.0  # m
 _EPISODES = 256
 
 
-@per_release("tunnel")
+@per_case
 def repeated_observations(case: Case) -> Bool[np.ndarray, " k"]:
     """Return True for each observation that comes out the same in an environment made a second time."""
     actions = case.rng("env_determinism").uniform(-1.0, 2.0, (_EPISODE_STEPS, 2)).astype(np.float32)
@@ -161,7 +161,7 @@ def _roll_out(env: st.TunnelEnv, params: EnvParams, key: jax.Array, actions: jax
     return jnp.concatenate([first[None], rest])
 
 
-@per_release("tunnel")
+@per_case
 def odometry_drift(case: Case) -> float:
     """Return the root mean square error of the odometer after 100 m at top speed, m."""
     env, params = make_environment(case)

@@ -1,14 +1,8 @@
-"""The released scene: files and hashes, rays, inventory, rail seats.
+"""The released scene: files, rays, inventory, rail seats."""
 
-Results from released files are kept while the files are the same: controls that change neither scene nor planar tunnel
-then cost SCN and PAR nothing.
-"""
-
-from collections.abc import Callable
 from dataclasses import dataclass
-from hashlib import sha256
+from functools import lru_cache
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree
 
 import mujoco
@@ -18,53 +12,12 @@ from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
 from benchmarks.fidelity.candidate import Geoms, Track, load_model, track_of
-from benchmarks.fidelity.case import SHARED, Case, Function, kept_in, per_case
+from benchmarks.fidelity.case import Case, per_case
 from benchmarks.fidelity.derive.curve import candidate_curve, interpolate_rows
 from benchmarks.fidelity.derive.mesh import face_parts
-from benchmarks.fidelity.derive.surface import Caster, surface_caster, visible_bodies
+from benchmarks.fidelity.derive.surface import Caster, surface_caster
 from benchmarks.fidelity.meshes import concatenate_meshes, connected_groups
 from subterra_jax.host.tunnelfile import read_fields
-
-
-def per_release(*reads: str) -> Callable[[Function], Function]:
-    """Keeps the result of a function of released files in this process for as long as the files stay the same.
-
-    Args:
-        *reads: Files read: `scene` (MJCF with its meshes), `tunnel` (planar tunnel), `mesh` (visible surface and
-            centreline).
-    """
-
-    def place(case: Case) -> tuple[dict[Any, Any], tuple[Any, ...]]:
-        return SHARED, (case.seed, tuple(_HASHES[name](case) for name in reads))
-
-    return lambda function: kept_in(function, place)
-
-
-@per_case
-def scene_hash(case: Case) -> str:
-    """Return the SHA-256 of the MJCF and of every file that it names."""
-    scene = case.candidate.scene
-    digest = sha256(scene.read_bytes())
-    for path in asset_files(scene):
-        digest.update(path.name.encode() + path.read_bytes())
-    return digest.hexdigest()
-
-
-@per_case
-def tunnel_hash(case: Case) -> str:
-    return sha256(case.candidate.tunnel.read_bytes()).hexdigest()
-
-
-@per_case
-def mesh_hash(case: Case) -> str:
-    """Return the SHA-256 of the visible surface and the centreline in memory."""
-    digest = sha256(case.candidate.bore.position.tobytes())
-    for mesh in visible_bodies(case.candidate).values():
-        digest.update(np.ascontiguousarray(mesh.vertices).tobytes() + np.ascontiguousarray(mesh.faces).tobytes())
-    return digest.hexdigest()
-
-
-_HASHES = {"scene": scene_hash, "tunnel": tunnel_hash, "mesh": mesh_hash}
 
 
 def asset_files(scene: Path) -> list[Path]:
@@ -76,22 +29,26 @@ def asset_files(scene: Path) -> list[Path]:
     return [folders[kind] / str(name) for kind, name in sorted(files)]
 
 
-@per_release("scene")
 def scene_model(case: Case) -> mujoco.MjModel:
     """Return the compiled scene.
 
     Raises:
         ValueError: MuJoCo refuses it.
     """
-    return load_model(case.candidate.scene)
+    return _compile_scene(case.candidate.scene, case.candidate.scene.stat().st_mtime_ns)
 
 
-@per_release("scene")
+@lru_cache(maxsize=1)  # null tube, truth and most controls have the scene of the reconstruction
+def _compile_scene(scene: Path, changed: int) -> mujoco.MjModel:
+    return load_model(scene)
+
+
+@per_case
 def scene_geoms(case: Case) -> Geoms:
     return Geoms.of(scene_model(case))
 
 
-@per_release("scene")
+@per_case
 def scene_track(case: Case) -> Track:
     """Return the track of the compiled scene, whatever the candidate has in memory."""
     return track_of(scene_geoms(case))
@@ -148,7 +105,7 @@ class RayPairs:
     comparable: Bool[np.ndarray, " k"]  # True where MuJoCo hit a part of those meshes
 
 
-@per_release("scene", "mesh")
+@per_case
 def rays_from_axis(case: Case) -> RayPairs:
     """Casts rays all around from random places of the centreline."""
     _, eye, _ = random_stations(case, "mj_ray_vs_mesh_mae", _EYES)
