@@ -21,9 +21,8 @@ from benchmarks.records import Record, measured, write_records
 from benchmarks.results import markdown_table
 from scene.build import reconstruct
 from scene.config import ReconstructConfig
-from scene.errors import FitError, RecordingError
 from scene.poses.calibration import load_calibration
-from scene.poses.clocks import settle_inertial, settle_poses
+from scene.poses.clocks import settle
 from scene.poses.imu import find_inertial
 from scene.poses.trajectory import Trajectory, load_tum, save_tum
 from scene.progress import Stages
@@ -162,18 +161,18 @@ def read_case(drive: Drive, case: Case, path: Path) -> Row:
             lag, error = None, 0.0
             if case.beside == "trajectory":
                 late = replace(drive.poses, times=drive.poses.times + case.late)
-                lag = settle_poses(recording, late, True)[0].offset
+                lag = settle(recording, late, True)[0].offset
             elif case.beside == "IMU":
                 inertial, _ = find_inertial(recording, load_calibration(path.parent / "calibration.yaml"))
                 if inertial is not None:
-                    lag = settle_inertial(recording, inertial, True)[0].offset
+                    lag = settle(recording, inertial, True)[0].offset
             times = recording.convention
             error = time_error(drive, case, recording, case.late - (lag or 0.0))
             said = recording.facts["point_times"]
-    except (RecordingError, FitError) as refused:
+    except Exception as refused:  # a defect is a wrong reason, too
         share = case.convention.bad_times
         true = share > _MOST_BAD and "% of the points" in str(refused) and "none of their sweep" in str(refused)
-        return Row(case, "refused, true reason" if true else "refused, other reason", "refused", str(refused))
+        return Row(case, "refused, true reason" if true else "refused, other reason", "refused", repr(refused))
     said = f"{said}; clock {lag}, times off by {error:.4f} s"
     if times.kind == "static" and case.convention.point_times in ("constant", "none"):
         return Row(case, "static, as said", "static", said)
@@ -182,7 +181,7 @@ def read_case(drive: Drive, case: Case, path: Path) -> Row:
 
 
 def time_error(drive: Drive, case: Case, recording: Recording, late: float) -> float:
-    """Return the largest error of a point's time, s; infinite where sweeps are missing or points are others.
+    """Return the largest error of a good point's time, s; infinite where sweeps are missing or points are others.
 
     It counts against the clock beside the LiDAR, which is still `late`, s. Without one, a shift of all times is none.
     """
@@ -198,7 +197,8 @@ def time_error(drive: Drive, case: Case, recording: Recording, late: float) -> f
             return np.inf
         errors.append(scan.stamp + scan.times - at[found])
     off = np.concatenate(errors)
-    return float(np.abs(off - (np.median(off) if case.beside == "nothing" else late)).max())
+    off = np.abs(off - (np.median(off) if case.beside == "nothing" else late))
+    return float(np.quantile(off, 1.0 - case.convention.bad_times))  # a bad time may look like one of the sweep
 
 
 def build_case(drive: Drive, case: Case, path: Path) -> Float[np.ndarray, "n m"]:
@@ -227,6 +227,8 @@ def measure(config: RecordingsConfig) -> tuple[list[Row], list[float]]:
                 same = built.shape == bore.shape
                 apart.append(float(np.sqrt(np.mean((built - bore) ** 2))) if same else np.inf)
             _remove(path)
+            with (config.out / "rows.jsonl").open("a") as lines:
+                lines.write(json.dumps(asdict(rows[-1])) + "\n")
             if rows[-1].outcome in OUTCOMES[3:]:
                 print(f"{k}: {rows[-1].outcome}: {rows[-1].said}", flush=True)
     return rows, apart
@@ -272,8 +274,6 @@ def run(config: RecordingsConfig) -> int:
     print(
         f"bores of {len(apart)} built: {', '.join(f'{1e3 * value:.2f}' for value in apart)} mm RMS from the control's"
     )
-    lines = [json.dumps(asdict(row)) for row in rows]
-    (config.out / "rows.jsonl").write_text("\n".join(lines) + "\n")
     write_records(config.out / "records.json", records_of(config, rows, apart))
     return int(any(row.outcome == "wrong in silence" for row in rows))
 
@@ -285,6 +285,9 @@ def records_of(config: RecordingsConfig, rows: list[Row], apart: list[float]) ->
     found = Counter((kind, row.outcome) for row in rows for kind in properties(row))
     ids = {f"{_id(kind)}/{_id(outcome)}": found[kind, outcome]
            for kind in dict.fromkeys(kind for kind, _ in found) for outcome in OUTCOMES}  # fmt: skip
+    taken = Counter((row.case.convention.point_times, row.decided) for row in rows)
+    true = dict.fromkeys(true for true, _ in taken)
+    ids |= {f"taken/{_id(one)}/{_id(other)}": taken[one, other] for one in true for other in _DECIDED.values()}
     records = [measured(f"recordings/{id}", n, "", command, **further) for id, n in ids.items()]
     if apart:
         value = round(1e3 * max(apart), 2)

@@ -6,7 +6,7 @@ bore, `fitting` of axis, wall, lining and track, `judging` of the bore against a
 
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -218,12 +218,12 @@ def judge(result: Reconstruction, track: Track, config: JudgingConfig) -> Judgem
         zone = track_zone(track, result.bore)
         judgement = judge_bore(result.bore, result.everything, config, zone, result.cause, result.removed, spacing)
     doubt = result.facts.get("clock_doubt") or result.facts.get("pose_doubt")
-    seen = _blame_poses(judgement.warnings) if doubt else judgement.warnings
+    seen = blame_poses(judgement.warnings) if doubt else judgement.warnings
     found = sorted([*odd, *seen], key=lambda warning: not warning.refuses)
     return replace(judgement, warnings=tuple(found))
 
 
-def _blame_poses(warnings: tuple[Warned, ...]) -> list[Warned]:
+def blame_poses(warnings: Iterable[Warned]) -> list[Warned]:
     """Return warnings that name nothing in the bore: where clocks or poses are at fault, they scatter the returns."""
     share = "; the poses, or their clock, scatter them"
     return [
@@ -285,7 +285,7 @@ def command(
 
     Args:
         source: A bag (ROS1, ROS2, MCAP), a folder of bags or of timed scans, a cloud (PLY, PCD, LAS, E57,
-            PTX, PTS, XYZ, CSV, Parquet) or a ring survey (CSV, XLSX).
+            PTX, PTS, XYZ, CSV) or a ring survey (CSV, XLSX).
         more: Further bags of the same recording.
         out: Folder to write; replaced only once the new scene is complete.
         trajectory: Poses of the LiDAR in TUM form, for a bag; without it, LiDAR odometry.

@@ -13,7 +13,7 @@ from scene.errors import FitError
 from scene.fitting.assemble import describe_bore
 from scene.fitting.lining import LiningConfig, add_standard_lining, joints_by_number
 from scene.fitting.unroll import UNSEEN_GROWTH, probability_known
-from scene.geometry import arc_length, axis_through, make_axis, section_angles
+from scene.geometry import arc_length, axis_through, section_angles
 from scene.reading.ringsurvey import RingSurvey
 
 _MIN_POINTS = 5
@@ -94,20 +94,6 @@ def bore_from_rings(fit: RingFit, origin: Float[np.ndarray, "3"]) -> Bore:
     )
 
 
-def compare_with_design(fit: RingFit, design: Float[np.ndarray, "d 4"]) -> dict[str, float]:
-    """Compares the rings with the design axis: chainage, easting, northing, elevation, m, in order."""
-    axis = make_axis(design[:, 0], design[:, 1:], _tangents(design[:, 1:]))
-    chainage, left, up = axis.local(fit.centre)
-    return {
-        "chainage_first": float(chainage[0]),
-        "chainage_last": float(chainage[-1]),
-        "right_of_design_mean": float(-left.mean()),
-        "right_of_design_sd": float(left.std()),
-        "above_design_mean": float(up.mean()),
-        "above_design_sd": float(up.std()),
-    }
-
-
 def _tangents(centre: np.ndarray) -> np.ndarray:
     chord = arc_length(centre)
     tangent = CubicSpline(chord, centre)(chord, 1)
@@ -184,6 +170,5 @@ def fit_ring_survey(
         "residual_rms": float(np.sqrt(np.mean(fit.rms**2))),
         "largest_target_offset": float(max(offset.max() for offset in survey.offsets)),
         "flat_floor": False,
-        **({} if survey.design is None else compare_with_design(fit, survey.design)),
     }
     return bore, origin, provenance, facts

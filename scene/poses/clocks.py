@@ -9,7 +9,7 @@ Source: Wahba, A Least Squares Estimate of Satellite Attitude, 1965: the best ro
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -19,6 +19,7 @@ from scene.poses.imu import Inertial, integrals
 from scene.poses.odometry import MIN_POINTS, Guide, Tracker
 from scene.poses.trajectory import Trajectory
 from scene.reading.recording import Recording
+from scene.reading.times import Scan
 
 NOTICED = 0.010  # s; a smaller offset is within what turn rates tell
 _SWEEPS, _FEWEST = 100, 40  # that are matched one to the next; with fewer nothing is told
@@ -29,8 +30,9 @@ _REACH, _STEP = 1.5, 0.005  # s: largest lag that is tried, and between two lags
 _AGREE = 0.8  # correlation of turn rates from which a lag counts
 _LIVELY = 0.03  # rad/s, mean size less the mean; a carrier that turns more evenly tells no lag
 _LONGEST = 3.0  # times the median size
-_OVERLAP = 0.5  # of the recording's time
+_OVERLAP = 0.5  # of the shorter one's time
 
+Timed = TypeVar("Timed", Inertial, Trajectory)
 Turns = Callable[[Float[np.ndarray, " k"], Float[np.ndarray, " k"]], Float[np.ndarray, "k 3"]]
 
 
@@ -57,7 +59,9 @@ def lidar_turns(recording: Recording) -> LidarTurns | None:
     for _ in range(_PASSES):
         tracker, times = Tracker(), list[float]()
         for scan in scans:
-            middle = scan.stamp + 0.5 * float(scan.times.max(initial=0.0))
+            first = float(scan.times.min())  # the first beams may have met nothing
+            scan = Scan(scan.stamp + first, scan.points, scan.times - first)
+            middle = scan.stamp + 0.5 * float(scan.times.max())
             if not times or middle > times[-1]:
                 tracker.register(scan, middle, guide)
                 times.append(middle)
@@ -144,26 +148,21 @@ class Clock:
         )
 
 
-def settle_poses(recording: Recording, poses: Trajectory, auto: bool) -> tuple[Clock, Trajectory]:
-    """Return what the turns of sweeps and poses tell of their clocks, and the poses by the LiDAR's clock."""
-    lag = _lag(recording, turns_of_poses(poses))
-    noticed = lag is not None and abs(lag) >= NOTICED
-    moved = replace(poses, times=poses.times - lag) if lag is not None and noticed else poses
-    return Clock("the trajectory", lag, noticed and auto), moved
-
-
-def settle_inertial(recording: Recording, inertial: Inertial, auto: bool) -> tuple[Clock, Inertial]:
-    """Return what the turns of sweeps and gyro tell of their clocks, and the samples by the LiDAR's clock where `auto`.
+def settle(recording: Recording, other: Timed, auto: bool) -> tuple[Clock, Timed]:
+    """Return what the turns of sweeps and of another instrument tell of their clocks, and it by the LiDAR's clock.
 
     Raises `RecordingError` where the two share no time, and not `auto`.
     """
-    apart = _apart(recording, inertial, auto)
-    moved = replace(inertial, times=inertial.times - apart) if apart else inertial
-    lag = _lag(recording, turns_of_gyro(moved))
-    if lag is not None and abs(lag) >= NOTICED and auto:
-        moved = replace(moved, times=moved.times - lag)
-    offset = apart + lag if lag is not None else (apart or None)
-    return Clock(f"the IMU {inertial.topic}", offset, auto and moved is not inertial), moved
+    if isinstance(other, Inertial):
+        of, turns = f"the IMU {other.topic}", turns_of_gyro(other)
+    else:
+        of, turns = f"the trajectory {other.path.name}", turns_of_poses(other)
+    apart = _apart(recording, of, other.times, auto)
+    lag = _lag(recording, lambda start, end: turns(start + apart, end + apart))
+    offset = None if lag is None and not apart else apart + (lag or 0.0)
+    if offset is None or abs(offset) < NOTICED:
+        return Clock(of, offset), other
+    return Clock(of, offset, auto), replace(other, times=other.times - offset)
 
 
 def _lag(recording: Recording, other: Turns) -> float | None:
@@ -174,10 +173,8 @@ def _lag(recording: Recording, other: Turns) -> float | None:
     """
     lidar = lidar_turns(recording)
     lag = None if lidar is None else find_lag(lidar, other)
-    if lag is None:
-        return None
     times = recording.convention
-    if not times.guessed or times.length < 2 * NOTICED or abs(lag + times.length) > 3 * NOTICED:
+    if lag is None or not times.guessed or times.length < 2 * NOTICED or abs(lag + times.length) > 3 * NOTICED:
         return lag
     recording.take_end()
     print(f"point times {recording.facts['point_times']}", flush=True)
@@ -185,16 +182,16 @@ def _lag(recording: Recording, other: Turns) -> float | None:
     return None if lidar is None else find_lag(lidar, other)
 
 
-def _apart(recording: Recording, inertial: Inertial, auto: bool) -> float:
+def _apart(recording: Recording, of: str, times: Float[np.ndarray, " n"], auto: bool) -> float:
     """Return how far the beginnings of two clocks are apart that share no time, s; 0 where they do."""
     begin, end = float(recording.stamps.min()), float(recording.stamps.max())
-    first, last = float(inertial.times[0]), float(inertial.times[-1])
-    if min(end, last) - max(begin, first) >= _OVERLAP * (end - begin):
+    first, last = float(times[0]), float(times[-1])
+    if min(end, last) - max(begin, first) >= _OVERLAP * min(end - begin, last - first):
         return 0.0
     if auto:
         return first - begin
     raise RecordingError(
-        f"{recording.path}: the IMU {inertial.topic} runs from {first:.2f} to {last:.2f} s, but the LiDAR "
-        f"{recording.topic} from {begin:.2f} to {end:.2f} s: their clocks are {first - begin:.6g} s apart; "
-        "--clock auto lays their beginnings on each other"
+        f"{recording.path}: {of} runs from {first:.2f} to {last:.2f} s, but the LiDAR {recording.topic} from "
+        f"{begin:.2f} to {end:.2f} s: their clocks are {first - begin:.6g} s apart; --clock auto lays their "
+        "beginnings on each other"
     )

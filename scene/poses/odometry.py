@@ -27,6 +27,7 @@ _NEIGHBOURS = 10  # whose spread is a point's covariance
 _HORIZON = 100  # sweeps that an unseen voxel of the map is kept for
 _WARM_UP = 5  # sweeps before the expectation is worth anything without a guide
 _KNOTS = 11  # poses that a sweep is unwound with
+_LEAST_SPAN = 1e-3  # s, of a static sweep: stamps since 1970 have 2e-7 s
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,7 @@ class Tracker:
 
     def _unwound(self, scan: Scan, middle: float, guide: Guide | None, step: np.ndarray, gap: float) -> np.ndarray:
         """Return the sweep's points as seen from where the sensor was in the middle of it, m."""
-        times = np.linspace(scan.stamp, max(2 * middle - scan.stamp, scan.stamp + 1e-6), _KNOTS)
+        times = np.linspace(scan.stamp, max(2 * middle - scan.stamp, scan.stamp + _LEAST_SPAN), _KNOTS)
         share = (times - middle) / gap
         shifts = share[:, None] * step[:3, 3]
         if guide is None:

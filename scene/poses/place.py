@@ -3,7 +3,6 @@
 Poses are given, or come from odometry alone, or from control with odometry and IMU.
 """
 
-import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -17,12 +16,12 @@ from scene.cloud import Cloud
 from scene.errors import RecordingError
 from scene.inputs import hash_inputs
 from scene.poses.calibration import Calibration, Mount
-from scene.poses.clocks import settle_inertial, settle_poses
+from scene.poses.clocks import settle
 from scene.poses.consistency import check_poses, reorder
 from scene.poses.imu import Inertial, find_inertial, gyro_guide, level_rotation
 from scene.poses.odometry import LIBRARY, Guide, Odometry, estimate_odometry
 from scene.poses.registration import register_scans
-from scene.poses.smoother import Noise, Problem, imu_steps, inertial_problem, odometry_problem, solve_with_heading
+from scene.poses.smoother import Noise, Problem, imu_steps, inertial_problem, solve_with_heading
 from scene.poses.terms import Chain
 from scene.poses.trajectory import MIN_CONTROL_SHARE, Control, Trajectory, load_control, load_tum
 from scene.progress import Stages
@@ -43,9 +42,9 @@ class Located:
     most_uncovered: float = 0.05  # Share of the scans that may lie outside the trajectory's time
 
 
-def run_odometry(recording: Recording, guide: Guide | None, progress: Stages, turn: str = "first") -> Odometry:
+def run_odometry(recording: Recording, guide: Guide | None, progress: Stages) -> Odometry:
     """Runs LiDAR odometry as a stage of a build."""
-    return estimate_odometry(recording, guide, progress.start(f"LiDAR odometry, {turn} pass", recording.scan_count))
+    return estimate_odometry(recording, guide, progress.start("LiDAR odometry", recording.scan_count))
 
 
 def locate_given(trajectory: Trajectory) -> Located:
@@ -69,8 +68,8 @@ def _find_timed(
     inertial, mount = find_inertial(recording, calibration)
     if inertial is None:
         return None, None, {}
-    clock, inertial = settle_inertial(recording, inertial, auto)
-    return inertial, mount, clock.facts
+    clock, timed = settle(recording, inertial, auto)
+    return timed if clock.corrected else inertial, mount, clock.facts
 
 
 def locate_by_odometry(recording: Recording, calibration: Calibration, progress: Stages, auto: bool = False) -> Located:
@@ -96,7 +95,6 @@ def locate_by_odometry(recording: Recording, calibration: Calibration, progress:
 
 # Guides: what is trusted of the turn (rad) and the shift (m) from one sweep to the next.
 _BY_CONTROL = (np.deg2rad(0.1), 0.02)
-_BY_CONTROL_WITHOUT_IMU = (np.deg2rad(0.5), 0.02)
 _OUTLIER = 4.0  # standard deviations
 _END_ERROR = 0.05  # m; an end of the bore is found to this, on simulated surveys
 
@@ -110,25 +108,25 @@ def locate_by_control(
 ) -> Located:
     """Locates the LiDAR in the control's frame from control, odometry and IMU, whose clock is set right with `auto`.
 
-    Raises `RecordingError` where the control does not overlap the recording, and `FitError` for too few scans, or where
-    the measurements do not determine the trajectory.
+    Raises `RecordingError` where the control does not overlap the recording or no IMU is known, and `FitError` for too
+    few scans, or where the measurements do not determine the trajectory.
     """
     times = recording.stamps
     if len(times) < 2:
         raise RecordingError(f"{recording.path}: holds {len(times)} scans; at least 2 are needed")
     control.require_overlap(times[0], times[-1], recording.path)
     inertial, mount, clock = _find_timed(recording, calibration, auto)
-    if inertial and mount:
-        problem, chain = _solve_with_imu(recording, inertial, mount, control, calibration, progress)
-        trajectory = _lidar_poses(chain, mount)
-    else:
-        problem, chain = _solve_without_imu(recording, control, calibration, progress)
-        trajectory = _lidar_poses(chain, Mount(np.eye(3), np.zeros(3)))
+    if inertial is None or mount is None:
+        raise RecordingError(
+            f"{control.path}: control goes with an IMU whose mount is known, and {recording.path} has none; "
+            "--calibration names it, or --trajectory gives whole poses"
+        )
+    problem, chain = _solve(recording, inertial, mount, control, calibration, progress)
     return Located(
-        trajectory,
+        _lidar_poses(chain, mount),
         {
-            "poses": f"control, {LIBRARY}" + (f", IMU {inertial.topic}" if inertial else ""),
-            "imu": inertial.topic if inertial else None,
+            "poses": f"control, {LIBRARY}, IMU {inertial.topic}",
+            "imu": inertial.topic,
             "calibration": calibration.name,
             "prism_lever": calibration.prism,
             **clock,
@@ -139,7 +137,7 @@ def locate_by_control(
     )
 
 
-def _solve_with_imu(
+def _solve(
     recording: Recording,
     inertial: Inertial,
     mount: Mount,
@@ -153,19 +151,6 @@ def _solve_with_imu(
     odometry = run_odometry(recording, Guide(_lidar_poses(guess, mount), True, *_BY_CONTROL), progress)
     whole = replace(problem, steps=imu_steps(odometry, guess, mount))
     return whole, _smooth(progress, lambda: whole.solve(guess)[0])
-
-
-def _solve_without_imu(
-    recording: Recording, control: Control, calibration: Calibration, progress: Stages
-) -> tuple[Problem, Chain]:
-    """Smooths twice: the first result guides the second odometry, which then slips less."""
-    guide = None
-    for pass_name in ("first", "second"):
-        odometry = run_odometry(recording, guide, progress, pass_name)
-        problem, guess = odometry_problem(odometry, control, calibration.prism, Noise())
-        chain = _smooth(progress, functools.partial(solve_with_heading, problem, guess))
-        guide = Guide(_lidar_poses(chain, Mount(np.eye(3), np.zeros(3))), True, *_BY_CONTROL_WITHOUT_IMU)
-    return problem, chain
 
 
 def _control_facts(problem: Problem, chain: Chain, control: Control) -> dict[str, Any]:
@@ -263,13 +248,13 @@ def _check_given(recording: Recording, given: Trajectory, reading: ReadingConfig
     """
     told, auto = reading.quaternion, reading.clock == "auto"
     poses = reorder(given) if told == "wxyz" else given
-    clock, timed = settle_poses(recording, poses, auto)
+    clock, timed = settle(recording, poses, auto)
     check = check_poses(recording, timed, told is None)
     order = "xyzw (by default)" if told is None else f"{told} (by flag)"
     if check is not None and check.wxyz:
         poses, order = reorder(given), "wxyz (detected: as xyzw they blur the walls)"
         print(f"quaternions of {given.source}: {order}", flush=True)
-        clock, timed = settle_poses(recording, poses, auto)
+        clock, timed = settle(recording, poses, auto)
         check = check_poses(recording, timed, False)
     located = locate_given(timed if clock.corrected else poses)
     facts = {**located.facts, "quaternions": order, **clock.facts, **({} if check is None else check.facts)}

@@ -1,6 +1,6 @@
 """Scans and poses to one cloud: every return moved from the pose at its own time."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -50,27 +50,37 @@ def register_scans(
     Scans that the trajectory does not cover are left out. Raises `RecordingError` where they are more than
     `most_uncovered`, a share, and `FitError` where no point is left.
     """
-    state, batch = _Registration(VoxelMean(voxel)), []
+    thinned, low, batch = VoxelMean(voxel), [np.empty((0, 3))], list[np.ndarray]()
+    placed, uncovered, every = 0, 0, 1
+    begin, end = np.inf, -np.inf
     for scan in recording.scans():
         stage.advance()
-        state.span = (min(state.span[0], scan.stamp), max(state.span[1], scan.end))
-        if trajectory.covers(scan.stamp, scan.end):
-            batch.append(deskew(scan, trajectory))
-            state.keep_low(scan, batch[-1], trajectory)
-        else:
-            state.uncovered += 1
+        begin, end = min(begin, scan.stamp), max(end, scan.end)
+        if not trajectory.covers(scan.stamp, scan.end):
+            uncovered += 1
+            continue
+        batch.append(deskew(scan, trajectory))
+        placed += 1
+        if placed % every == 0:
+            low.append(_low_returns(scan, batch[-1], trajectory))
         if len(batch) == _BATCH:
-            state.thinned.add(np.concatenate(batch))
-            state.choose_every(recording.scan_count, trajectory)
+            thinned.add(np.concatenate(batch))
+            if placed == _BATCH:
+                every = _choose_every(thinned.returns / _BATCH * recording.scan_count, trajectory)
             batch = []
     if batch:
-        state.thinned.add(np.concatenate(batch))
-    _require_covered(state, recording, trajectory, most_uncovered)
-    cloud = state.thinned.cloud()
+        thinned.add(np.concatenate(batch))
+    if uncovered > most_uncovered * max(recording.scan_count, 1):
+        raise RecordingError(
+            f"{trajectory.source}: covers {trajectory.times[0]:.2f} to {trajectory.times[-1]:.2f} s, but "
+            f"{recording.path} runs from {begin:.2f} to {end:.2f} s; {uncovered} of "
+            f"{recording.scan_count} scans have no pose"
+        )
+    cloud = thinned.cloud()
     if not len(cloud.points):
         raise FitError(f"{recording.path}: no return is left after registration")
-    low = np.concatenate([np.empty((0, 3)), *state.low]) - cloud.origin
-    return Registered(cloud, state.uncovered, low[np.isfinite(low).all(axis=1)])
+    chosen = np.concatenate(low) - cloud.origin
+    return Registered(cloud, uncovered, chosen[np.isfinite(chosen).all(axis=1)])
 
 
 # m from the sensor: nearer, the noise of a range moves a return across the face of a rail; farther, poses do.
@@ -79,41 +89,15 @@ _BELOW = 0.3  # m under the sensor
 _A_METRE = 70_000  # returns for each metre of the way that are looked at: several thousand then lie on the faces
 
 
-@dataclass
-class _Registration:
-    """State of a registration between two batches."""
-
-    thinned: VoxelMean
-    uncovered: int = 0
-    span: tuple[float, float] = (np.inf, -np.inf)
-    low: list[np.ndarray] = field(default_factory=list)
-    placed: int = 0  # scans
-    every: int = 1  # scan of which the low returns are kept
-
-    def keep_low(self, scan: Scan, points: Float[np.ndarray, "n 3"], trajectory: Trajectory) -> None:
-        """Keeps returns of a placed scan that may lie on rails."""
-        self.placed += 1
-        if self.placed % self.every:
-            return
-        reach = np.linalg.norm(scan.points, axis=1)
-        ends = np.array([scan.stamp, scan.end])
-        height = trajectory.at(ends)[0][:, 2].mean() - _BELOW
-        near = (reach > _LOW_RANGE[0]) & (reach < _LOW_RANGE[1]) & (points[:, 2] < height)
-        self.low.append(points[near])
-
-    def choose_every(self, scans: int, trajectory: Trajectory) -> None:
-        """Chooses how many scans give low returns, once the first batch tells how many returns a scan has."""
-        if self.placed != _BATCH:
-            return
-        seconds = np.arange(trajectory.times[0], trajectory.times[-1], 1.0)
-        way = float(np.linalg.norm(np.diff(trajectory.at(seconds)[0], axis=0), axis=1).sum())
-        self.every = max(int(self.thinned.returns / _BATCH * scans / max(way, 1.0) / _A_METRE), 1)
+def _low_returns(scan: Scan, points: Float[np.ndarray, "n 3"], trajectory: Trajectory) -> Float[np.ndarray, "k 3"]:
+    """Return those of a placed scan that may lie on rails."""
+    reach = np.linalg.norm(scan.points, axis=1)
+    height = trajectory.at(np.array([scan.stamp, scan.end]))[0][:, 2].mean() - _BELOW
+    return points[(reach > _LOW_RANGE[0]) & (reach < _LOW_RANGE[1]) & (points[:, 2] < height)]
 
 
-def _require_covered(state: _Registration, recording: Recording, trajectory: Trajectory, most_uncovered: float) -> None:
-    if state.uncovered > most_uncovered * max(recording.scan_count, 1):
-        raise RecordingError(
-            f"{trajectory.source}: covers {trajectory.times[0]:.2f} to {trajectory.times[-1]:.2f} s, but "
-            f"{recording.path} runs from {state.span[0]:.2f} to {state.span[1]:.2f} s; {state.uncovered} of "
-            f"{recording.scan_count} scans have no pose"
-        )
+def _choose_every(returns: float, trajectory: Trajectory) -> int:
+    """Return how many scans apart low returns are kept, of all returns along a trajectory."""
+    seconds = np.arange(trajectory.times[0], trajectory.times[-1], 1.0)
+    way = float(np.linalg.norm(np.diff(trajectory.at(seconds)[0], axis=0), axis=1).sum())
+    return max(int(returns / max(way, 1.0) / _A_METRE), 1)

@@ -1,4 +1,4 @@
-"""The trajectory of least cost: IMU or odometry, and control, on one chain of knots."""
+"""The trajectory of least cost: IMU, odometry and control, on one chain of knots."""
 
 from dataclasses import dataclass, replace
 
@@ -20,9 +20,8 @@ _TRIAL = 60.0  # s of the recording on which the mounting's heading is tried out
 _TRIAL_ITERATIONS, _ITERATIONS = 8, 25
 _CONVERGED = 1e-6  # rad and m
 _BIAS = (0.02, 0.3)  # rad/s, m/s²: biases that a MEMS gyro and accelerometer may start with
-_NO_BIAS = (1e-6, 1e-6)
 # Standard deviation of a position against the mean of two velocities, m: jerk · step³ / 12 of a walker's stride.
-_SMOOTH, SMOOTH_BETWEEN_SWEEPS = 2e-4, 5e-3
+_SMOOTH = 2e-4
 
 
 @dataclass(frozen=True)
@@ -46,8 +45,6 @@ class Problem:
     sightings: Sightings  # Sightings of the prism
     steps: Steps | None  # Steps of the odometry, where it ran
     noise: Noise  # Standard deviations of the instruments
-    # True where the rates come from an instrument, which has biases; otherwise the motion is only smooth
-    inertial: bool = True
 
     def solve(self, chain: Chain, iterations: int = _ITERATIONS) -> tuple[Chain, float]:
         """Return the chain of least cost near `chain`, and that cost."""
@@ -71,12 +68,8 @@ class Problem:
         reach = 1 if self.steps is None else int((self.steps.second - self.steps.first).max())
         equations = terms.NormalEquations(len(chain.times), terms.KNOT_SIZE, reach)
         noise = self.noise
-        if self.inertial:
-            terms.add_motion(equations, chain, self.motion, _SMOOTH)
-            terms.add_biases(equations, chain, _BIAS, (noise.gyro_walk, noise.accel_walk))
-        else:
-            terms.add_motion(equations, chain, self.motion, SMOOTH_BETWEEN_SWEEPS)
-            terms.add_biases(equations, chain, _NO_BIAS, _NO_BIAS)
+        terms.add_motion(equations, chain, self.motion, _SMOOTH)
+        terms.add_biases(equations, chain, _BIAS, (noise.gyro_walk, noise.accel_walk))
         self.sightings.add_to(equations, chain, noise.robust)
         if self.steps is not None:
             self.steps.add_to(equations, chain, noise.robust)
@@ -117,10 +110,8 @@ def _first_knots(problem: Problem, chain: Chain, n: int) -> tuple[Problem, Chain
 
 
 _KNOT_STEP = 0.025  # s; between two knots a walker's motion is straight to 0.2 mm and 0.005°
-# Standard deviation of one step of the odometry: rad, m across and m along the bore. Measured on simulated surveys.
-_STEP = (np.deg2rad(0.1), 0.02, 1.0)
-_FREE_TURN, _FREE_SPEED = 3.0, 1.0  # rad/√s and m/s/√s: changes of a carrier whose motion nothing measured
-# The same where an IMU guides the odometry, over one sweep: four knots, 0.1 s.
+# Standard deviation of a step of the odometry over one sweep, four knots, 0.1 s: rad, m across and m along the bore.
+# Measured on simulated surveys.
 _IMU_STEP_KNOTS = 4
 _IMU_STEP = (np.deg2rad(0.03), 0.01, 1.0)
 _LEVEL_TIME = 1.0  # s; over this a walker's accelerations cancel
@@ -179,34 +170,12 @@ def inertial_problem(
     spacing = float(np.median(np.diff(inertial.times)))
     rate, force = (means_between(times, inertial.times, values) for values in (inertial.rate, inertial.force))
     scale = np.sqrt(spacing)
-    motion = Motion(rate, force, noise.gyro * scale, noise.accel * scale, True)
+    motion = Motion(rate, force, noise.gyro * scale, noise.accel * scale)
     position, velocity = smooth_control(control, times)
     attitude = level_attitudes(times, np.vstack([rate, rate[-1:]]), np.vstack([force, force[-1:]]))
     zero = np.zeros((len(times), 3))
     chain = Chain(times, attitude, position - attitude @ lever, velocity, zero, zero)
     return Problem(motion, make_sightings(control, times, lever, noise.control), None, noise), chain
-
-
-def odometry_problem(
-    odometry: Odometry, control: Control, lever: Float[np.ndarray, "3"], noise: Noise
-) -> tuple[Problem, Chain]:
-    """Return the problem of a LiDAR with a prism: attitude and cross-axis shifts from odometry, else control.
-
-    Knots are the sweeps' poses; `lever` is the prism in LiDAR coordinates, m. Raises `FitError` where sweeps and
-    control share fewer than three times.
-    """
-    poses = odometry.trajectory
-    shared = np.flatnonzero((poses.times >= control.times[0]) & (poses.times <= control.times[-1]))
-    if len(shared) < 3:
-        raise FitError(f"{control.path}: only {len(shared)} sweeps lie within the control's time")
-    times, turns = poses.times[shared], poses.rotations[shared].as_matrix()
-    steps = _make_steps(np.arange(len(times)), turns, poses.positions[shared], odometry.weakest[shared[1:]], _STEP)
-    zero = np.zeros((len(times), 3))
-    free = Motion(zero[1:], zero[1:], _FREE_TURN, _FREE_SPEED, False)
-    position, velocity = smooth_control(control, times)
-    chain = Chain(times, turns, position - turns @ lever, velocity, zero, zero)
-    seen = make_sightings(control, times, lever, np.hypot(noise.control, SMOOTH_BETWEEN_SWEEPS))
-    return Problem(free, seen, steps, noise, inertial=False), chain
 
 
 def imu_steps(odometry: Odometry, chain: Chain, mount: Mount) -> Steps:

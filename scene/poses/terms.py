@@ -139,10 +139,9 @@ class Motion:
     """Mean rate and force between neighbouring knots."""
 
     rate: Float[np.ndarray, "k 3"]  # rad/s
-    force: Float[np.ndarray, "k 3"]  # m/s²; zero where nothing measured it
+    force: Float[np.ndarray, "k 3"]  # m/s²
     rate_sigma: float  # Standard deviation of the change of attitude, rad/√s
     force_sigma: float  # Standard deviation of the change of velocity, m/s/√s
-    has_force: bool  # True where `force` was measured; otherwise the velocity changes slowly
 
 
 def add_motion(equations: NormalEquations, chain: Chain, motion: Motion, smooth: float) -> None:
@@ -163,14 +162,13 @@ def add_motion(equations: NormalEquations, chain: Chain, motion: Motion, smooth:
     first[:, :3, _GYRO] = _EYE * span[:, :, None]
     second[:, :3, _TURN] = near
     residual[:, 3:6] = chain.velocity[after] - chain.velocity[here]
-    if motion.has_force:
-        half = rotation_matrices(0.5 * turn)
-        middle = before @ half
-        force = motion.force - chain.accel_bias[here]
-        residual[:, 3:6] -= (rotate_vectors(middle, force) - (0.0, 0.0, GRAVITY)) * span
-        first[:, 3:6, _TURN] = span[:, :, None] * (middle @ cross_matrices(force) @ half.mT)
-        first[:, 3:6, _GYRO] = -0.5 * span[:, :, None] ** 2 * (middle @ cross_matrices(force))
-        first[:, 3:6, _ACCEL] = span[:, :, None] * middle
+    half = rotation_matrices(0.5 * turn)
+    middle = before @ half
+    force = motion.force - chain.accel_bias[here]
+    residual[:, 3:6] -= (rotate_vectors(middle, force) - (0.0, 0.0, GRAVITY)) * span
+    first[:, 3:6, _TURN] = span[:, :, None] * (middle @ cross_matrices(force) @ half.mT)
+    first[:, 3:6, _GYRO] = -0.5 * span[:, :, None] ** 2 * (middle @ cross_matrices(force))
+    first[:, 3:6, _ACCEL] = span[:, :, None] * middle
     first[:, 3:6, _SPEED], second[:, 3:6, _SPEED] = -_EYE, _EYE
     residual[:, 6:] = chain.position[after] - chain.position[here]
     residual[:, 6:] -= 0.5 * span * (chain.velocity[after] + chain.velocity[here])

@@ -55,9 +55,12 @@ def read_rows(path: Path, kind: str) -> Float[np.ndarray, "n k"]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # an empty file is reported by the caller
-            return np.loadtxt(path, dtype=np.float64, ndmin=2)
+            rows = np.loadtxt(path, dtype=np.float64, ndmin=2)
     except (ValueError, UnicodeDecodeError, IsADirectoryError) as error:
         raise RecordingError(f"{path}: not {kind} ({error})") from error
+    if not np.isfinite(rows).all():
+        raise RecordingError(f"{path}: row {int(np.argmin(np.isfinite(rows).all(axis=1))) + 1} is not finite")
+    return rows
 
 
 def load_tum(path: Path) -> Trajectory:
@@ -68,8 +71,6 @@ def load_tum(path: Path) -> Trajectory:
     rows = read_rows(path, "a TUM trajectory")
     if rows.shape[1:] != (8,) or len(rows) < 2:
         raise RecordingError(f"{path}: a TUM trajectory has at least 2 rows of 8 numbers, found {rows.shape}")
-    if not np.isfinite(rows).all():
-        raise RecordingError(f"{path}: row {int(np.argmin(np.isfinite(rows).all(axis=1))) + 1} is not finite")
     norms = np.linalg.norm(rows[:, 4:], axis=1)
     if (norms == 0).all():
         raise RecordingError(
@@ -120,8 +121,6 @@ def load_control(path: Path) -> Control:
     rows = read_rows(path, "position control in TUM form")
     if rows.size and rows.shape[1] not in (4, 8):
         raise RecordingError(f"{path}: control has rows of 4 or 8 numbers (t x y z, TUM), found {rows.shape[1]}")
-    if rows.size and not np.isfinite(rows).all():
-        raise RecordingError(f"{path}: row {int(np.argmin(np.isfinite(rows).all(axis=1))) + 1} is not finite")
     unique = rows[np.unique(rows[:, 0], return_index=True)[1]] if rows.size else rows
     if len(unique) < _MIN_CONTROL_ROWS:
         raise RecordingError(f"{path}: control needs {_MIN_CONTROL_ROWS} rows at different times, found {len(unique)}")

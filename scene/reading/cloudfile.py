@@ -13,7 +13,6 @@ from scene.reading.formats import Format, ReadingConfig, detect
 from scene.reading.source import CloudSource, Frame, choose_frame, needs_local_points, refuse_damage
 from scene.reading.tables import told_columns
 
-_TABLES = ("table", "parquet")
 _COARSE, _HOPELESS = 0.02, 0.25  # m: coordinates rounded so far are told, and refused
 _REPEATED = 10  # points for each value of a coordinate: on a grid they repeat
 _MOST_OUTSIDE = 0.5  # share of the points that may lie too far from the first to be thinned
@@ -112,7 +111,7 @@ def measure_rounding(points: Float[np.ndarray, "n 3"]) -> tuple[float, float, fl
 
 def _open_cloud(path: Path, row: Format, config: ReadingConfig) -> CloudSource:
     """Opens a cloud; raises `RecordingError` for columns that are none, and for a format that has no columns."""
-    if config.columns is not None and row.name not in _TABLES:
+    if config.columns is not None and row.name != "table":
         raise RecordingError(f"{path}: --columns goes with a table, but this is {row.label}")
     if config.keep_noise and row.name == "las":
         return row.open(path, True)

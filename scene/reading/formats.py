@@ -14,7 +14,7 @@ from scene.reading.ply_pcd import open_pcd, open_ply
 from scene.reading.ringsurvey import is_ring_survey, read_ring_survey
 from scene.reading.rosbag import RosBag
 from scene.reading.scans import open_folder, scan_files
-from scene.reading.tables import open_parquet, open_ptx, open_table
+from scene.reading.tables import open_ptx, open_table
 from scene.reading.times import TimeConfig
 
 Kind = Literal["recording", "cloud", "rings"]
@@ -28,7 +28,7 @@ class ReadingConfig:
     """Facts about an input that the user gives, in place of detection."""
 
     topic: Annotated[str | None, _FLAG] = None  # LiDAR topic of a bag; found by its type where not given.
-    # Format of the input: bag, rosbag2, mcap, db3, scans, ply, pcd, las, e57, table, parquet, rings.
+    # Format of the input: bag, rosbag2, mcap, db3, scans, ply, pcd, las, e57, table, rings.
     format: Annotated[str | None, _FLAG] = None
     # Unit of a registered cloud or a ring survey: m, cm, mm, ft or us-ft.
     unit: Annotated[str | None, _FLAG] = None
@@ -71,7 +71,6 @@ _TABLE = (
     Format("e57", "E57", "cloud", open_e57, (".e57",), (b"ASTM-E57",)),
     Format("ptx", "PTX", "cloud", open_ptx, (".ptx",)),
     Format("table", "table", "cloud", open_table, (".xyz", ".csv", ".txt", ".asc", ".pts")),
-    Format("parquet", "Parquet", "cloud", open_parquet, (".parquet",), (b"PAR1",)),
     Format("rings", "ring survey", "rings", read_ring_survey, (".xlsx",)),
 )
 _PACKED = {b"\x28\xb5\x2f\xfd": "zstd -d", b"\x1f\x8b": "gzip -d", b"BZh": "bzip2 -d", b"\xfd7zXZ": "xz -d"}
@@ -133,7 +132,7 @@ def detect(path: Path, name: str | None = None) -> Detected:
         own = "".join(f", {row.label}" for row in _own.values())
         raise RecordingError(
             f"{path}: of no known kind; a ROS bag or MCAP, a folder of timed scans, a cloud (PLY, PCD, LAS, LAZ, E57, "
-            f"PTX, XYZ, CSV, Parquet) or a ring survey (CSV, XLSX){own} is needed"
+            f"PTX, XYZ, CSV) or a ring survey (CSV, XLSX){own} is needed"
         )
     return detected
 

@@ -1,8 +1,7 @@
-"""As-built surveys of rings, from CSV or XLSX, in either layout that surveyors use, with the design axis where given.
+"""As-built surveys of rings, from CSV or XLSX, in either layout that surveyors use.
 
 A ring survey has easting, northing and elevation, and names each point by `POINT` (`ring.point`) or by `RING NO.` and
-`POINT NO.`; `OFFSET`, where it is given, is the distance of the target off the wall. A table with `CHAINAGE` instead of
-rings is the design axis.
+`POINT NO.`; `OFFSET`, where it is given, is the distance of the target off the wall.
 """
 
 import csv
@@ -84,8 +83,6 @@ class RingSurvey:
     names: list[str]  # Ring numbers as written
     points: list[Float[np.ndarray, "k 3"]]  # Easting, northing, elevation of each ring's points, m each
     offsets: list[Float[np.ndarray, " k"]]  # Distance of each point inside the wall, m
-    # Chainage, easting, northing, elevation of the design axis, m; `None` where there is none
-    design: Float[np.ndarray, "d 4"] | None
     facts: dict[str, str]  # Detected facts, for people and the manifest
 
     def reversed(self) -> "RingSurvey":
@@ -124,14 +121,12 @@ def read_ring_survey(path: Path, unit: str | None = None, told: dict[str, str] |
     if unit not in (None, *UNITS):
         raise RecordingError(f"{path}: unit {unit!r} is none of {UNIT_NAMES}")
     rings: dict[str, list[tuple[float, ...]]] = {}
-    columns, headers, design = None, [], None
+    columns, headers = None, []
     with refuse_damage(path, "a readable survey", RecordingError), open_sheets(path) as tables:
         for sheet in tables:
             headers.append(",".join(sheet.header))
             if columns is None and (columns := _find_ring_columns(sheet.header, told)) is not None:
                 _read_rings(path, sheet, columns, rings)
-            elif design is None and (at := _find_design_columns(sheet.header)) is not None:
-                design = _read_design(path, sheet, at)
     if columns is None:
         raise RecordingError(f"{path}: columns are {' | '.join(headers)[:_SHOWN]!r}; {NEEDED} are needed")
     if len(rings) < _MIN_RINGS:
@@ -140,7 +135,7 @@ def read_ring_survey(path: Path, unit: str | None = None, told: dict[str, str] |
     how = "by flag" if unit else "declared" if columns.unit else "by default"
     layout = "POINT as ring.point" if columns.ring is None else "RING NO. and POINT NO."
     facts = {"format": f"{path.suffix[1:].upper()}, {layout}", "unit": f"{unit or columns.unit or 'm'} ({how})"}
-    return RingSurvey(path, list(rings), [r[:, :3] for r in rows], [r[:, 3] for r in rows], design, facts)
+    return RingSurvey(path, list(rings), [r[:, :3] for r in rows], [r[:, 3] for r in rows], facts)
 
 
 _RING = ("ring no", "ring", "ring number", "ring nr", "ringnr", "anneau", "anillo", "anello")
@@ -163,13 +158,6 @@ def _find_ring_columns(header: tuple[str, ...], told: dict[str, str] | None = No
     if point is None or (ring is None and not told and names[columns[0][0]] != "easting"):
         return None  # a cloud with numbers of points
     return _RingColumns(*columns, point, ring, at("offset", _OFFSET))
-
-
-def _find_design_columns(header: tuple[str, ...]) -> list[int] | None:
-    names = [plain_name(name)[0] for name in header]
-    columns = find_xyz(header)
-    rings = any(name.startswith("ring") for name in names)
-    return None if columns is None or rings or "chainage" not in names else [names.index("chainage"), *columns[0]]
 
 
 def _read_rings(path: Path, sheet: Sheet, columns: _RingColumns, rings: dict[str, list[tuple[float, ...]]]) -> None:
@@ -196,13 +184,3 @@ def _ring_name(row: tuple[Any, ...], columns: _RingColumns) -> str:
     if not dot:
         raise ValueError(f"point {name!r} is not ring.point as text")
     return ring
-
-
-def _read_design(path: Path, sheet: Sheet, at: list[int]) -> Float[np.ndarray, "d 4"]:
-    rows = []
-    for where, row in sheet.rows:
-        try:
-            rows.append([float(row[index]) for index in at])
-        except (ValueError, TypeError, IndexError) as error:
-            raise RecordingError(f"{path}: {where} is no point of the design axis ({cause(error)})") from error
-    return np.asarray(rows, np.float64).reshape(-1, 4)

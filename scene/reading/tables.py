@@ -1,4 +1,4 @@
-"""Clouds as text (XYZ, CSV, TXT, ASC, PTS, PTX) and Parquet, with x, y, z by the names of their columns.
+"""Clouds as text (XYZ, CSV, TXT, ASC, PTS) with x, y, z by the names of their columns, and PTX.
 
 A scan of a PTX file has ten lines before its points: columns, rows, place of the scanner, its three axes, and a matrix
 of four lines that takes a row of coordinates from the right (x, y, z, 1). A point at the origin is a direction without
@@ -12,12 +12,10 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 from jaxtyping import Float
 
 from scene.errors import RecordingError
-from scene.reading.source import BATCH, UNITS, CloudSource, Lines
+from scene.reading.source import BATCH, CloudSource, Lines
 
 # English, German, Spanish, French and Italian surveyors' words; the first one is that of a cloud, not of a map.
 _XYZ_NAMES = (
@@ -175,44 +173,6 @@ def _sample_lines(text: Lines) -> np.ndarray:
             except ValueError:
                 continue
     return np.concatenate(points)
-
-
-def open_parquet(path: Path, told: dict[str, str] | None = None) -> CloudSource:
-    """Opens the columns x, y, z (or easting, northing, elevation) of a Parquet file.
-
-    Raises `ValueError` for damage, missing columns, or columns that hold no numbers.
-    """
-    with pq.ParquetFile(path) as file:
-        names, rows = file.schema_arrow.names, file.metadata.num_rows
-        xyz = find_xyz(names, told)
-        if xyz is None:
-            raise ValueError(f"no columns x, y, z among {', '.join(names)}")
-        columns = [names[index] for index in xyz[0]]
-        for name in columns:
-            kind = file.schema_arrow.field(name).type
-            if not (pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_decimal(kind)):
-                raise ValueError(f"column {name} holds {kind}, not numbers")
-        declared = xyz[1] or _field_unit(file.schema_arrow.field(columns[0]))
-        groups = sorted({0, file.num_row_groups // 2, file.num_row_groups - 1}) if file.num_row_groups else []
-        sample = [next(_read_batches(file, columns, [group]), np.empty((0, 3)))[::100] for group in groups]
-
-    def chunks() -> Iterator[np.ndarray]:
-        with pq.ParquetFile(path) as file:
-            yield from _read_batches(file, columns, list(range(file.num_row_groups)))
-
-    return CloudSource("Parquet", chunks, np.concatenate([np.empty((0, 3)), *sample]), declared, rows)
-
-
-def _read_batches(file: pq.ParquetFile, columns: list[str], groups: list[int]) -> Iterator[np.ndarray]:
-    for batch in file.iter_batches(BATCH, columns=columns, row_groups=groups):
-        arrays = [batch.column(name).cast(pa.float64()).to_numpy(zero_copy_only=False) for name in columns]
-        yield np.stack(arrays, axis=1)
-
-
-def _field_unit(field: pa.Field) -> str | None:
-    """Unit from the column's own metadata, key `unit`."""
-    unit = (field.metadata or {}).get(b"unit", b"").decode("utf-8", "replace")
-    return unit if unit in UNITS else None
 
 
 _HEADER = 10  # lines

@@ -52,7 +52,7 @@ SCENES = ("scene.xml", "scene_furnished.xml")
 MANIFEST_SCHEMA = "subterra.manifest/1"
 _LIBRARIES = (
     "numpy", "scipy", "trimesh", "manifold3d", "mujoco", "rosbags", "small-gicp", "plyfile", "pypcd4", "laspy", "lazrs",
-    "pye57", "pyarrow", "openpyxl", "shapely",
+    "pye57", "openpyxl", "shapely",
 )  # fmt: skip
 _PREVIEW_VOXEL = 0.06  # m
 

@@ -6,8 +6,6 @@ from pathlib import Path
 import laspy
 import numpy as np
 import openpyxl
-import pyarrow as pa
-import pyarrow.parquet as pq
 import trimesh
 from pye57 import E57
 from pypcd4 import Encoding, PointCloud
@@ -51,11 +49,6 @@ def write_e57(path: Path, points: np.ndarray, *poses: tuple[np.ndarray, np.ndarr
     return path
 
 
-def write_parquet(path: Path, points: np.ndarray, names: tuple[str, ...] = ("x", "y", "z")) -> Path:
-    pq.write_table(pa.table({"intensity": np.ones(len(points)), **dict(zip(names, points.T, strict=True))}), path)
-    return path
-
-
 def write_text(path: Path, points: np.ndarray, delimiter: str = " ", header: str = "") -> Path:
     rows = [delimiter.join(f"{value:.6f}" for value in row) for row in points]
     path.write_text("\n".join([header] * bool(header) + rows) + "\n")
@@ -71,7 +64,6 @@ CLOUDS: dict[str, Callable[[Path, np.ndarray], Path]] = {
     "a.las": write_las,
     "a.laz": write_las,
     "a.e57": write_e57,
-    "a.parquet": write_parquet,
     "a.xyz": write_text,
     "a.csv": lambda path, points: write_text(path, points, ",", "X,Y,Z"),
 }
@@ -88,14 +80,10 @@ def ring_rows(count: int = 12, radius: float = 1.7, offset: float = 0.0, spacing
     ]
 
 
-def write_xlsx(path: Path, rows: list[tuple], design: list[tuple] | None = None, header: tuple = RING_HEADER) -> Path:
+def write_xlsx(path: Path, rows: list[tuple], header: tuple = RING_HEADER) -> Path:
     book = openpyxl.Workbook()
     book.active.title = "Survey"
     for row in [header, *rows]:
         book.active.append(row)
-    if design is not None:
-        sheet = book.create_sheet("Axis")
-        for row in [("POINT NO.", "CHAINAGE", "EASTING (M.)", "NORTHING (M.)", "ELEVATION (M.)"), *design]:
-            sheet.append(row)
     book.save(path)
     return path

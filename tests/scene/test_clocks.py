@@ -8,7 +8,7 @@ from scene.errors import RecordingError
 from scene.judging.codes import Code
 from scene.judging.sanity import doubt_bore
 from scene.poses import clocks
-from scene.poses.clocks import NOTICED, Clock, LidarTurns, find_lag, settle_inertial, turns_of_gyro, turns_of_poses
+from scene.poses.clocks import NOTICED, Clock, LidarTurns, find_lag, settle, turns_of_gyro, turns_of_poses
 from scene.poses.imu import Inertial
 from scene.poses.trajectory import Trajectory
 from scene.reading.times import Convention
@@ -66,8 +66,8 @@ class Beside:
 def test_clocks_years_apart_are_named_and_laid_on_each_other_on_request():
     late = gyro(-2e8, Rotation.identity())
     with pytest.raises(RecordingError, match=r"their clocks are -2e\+08 s apart; --clock auto"):
-        settle_inertial(Beside(), late, False)
-    clock, moved = settle_inertial(Beside(), late, True)
+        settle(Beside(), late, False)
+    clock, moved = settle(Beside(), late, True)
     assert clock.corrected
     assert clock.words is None
     np.testing.assert_allclose(moved.times, AT, atol=1e-6)
@@ -111,7 +111,7 @@ def test_headers_at_the_end_of_their_sweeps_are_told_by_the_turns_where_nothing_
 
     monkeypatch.setattr(clocks, "lidar_turns", shifted)
     recording, poses = Late(), Trajectory(AT, np.zeros((len(AT), 3)), attitude(AT), "poses")
-    clock, _ = clocks.settle_poses(recording, poses, False)
+    clock, _ = clocks.settle(recording, poses, False)
     assert (recording.late == 0.0) == ended
     assert clock.offset == pytest.approx(0.0 if ended else -0.1, abs=0.006)
     assert (clock.words is None) == ended

@@ -1,16 +1,22 @@
 """Well-formed and unusual files: what is no return is left out and counted, splits are read, packed ones named."""
 
 import gzip
+import xml.etree.ElementTree as ET
 
 import laspy
 import numpy as np
 import pytest
 from laspy.vlrs.known import WktCoordinateSystemVlr
+from mujoco import MjModel
 
+from scene.build import blame_poses
 from scene.errors import RecordingError
+from scene.judging.codes import Code
+from scene.judging.judge import Warned
 from scene.reading.cloudfile import read_cloud
 from scene.reading.formats import ReadingConfig, describe, detect, left_out
 from scene.reading.recording import Recording
+from scene.writing.folder import SCENES, state_crs
 from tests.scene.bags import write_bag
 from tests.scene.conventions import sweeps, write_convention
 from tests.scene.messages import PLAIN, pointcloud2, write_bag1
@@ -178,3 +184,25 @@ def test_what_was_left_out_is_said(tmp_path):
     las = write_las(tmp_path / "a.las", XYZ, withheld=range(30), noise=(40, 41))
     assert "left out: 30 points (withheld), 2 points (noise)" in describe({"kind": "cloud", **read_cloud(las, 0.01)[1]})
     assert left_out({"points_without_time": 5, "scans_without_pose": 0}) == "5 points without a time of their sweep"
+
+
+def test_both_scenes_hold_the_crs_of_their_input(tmp_path):
+    for scene in SCENES:
+        (tmp_path / scene).write_text("<mujoco>\n  <worldbody />\n</mujoco>\n")
+    state_crs(tmp_path, WKT)
+    for scene in SCENES:
+        MjModel.from_xml_path(str(tmp_path / scene))
+        assert ET.parse(tmp_path / scene).find("custom/text[@name='crs']").get("data") == WKT
+
+
+def test_nothing_in_the_bore_is_named_where_the_poses_scatter_the_returns():
+    said = [
+        Warned(
+            Code.UNEXPLAINED,
+            "7% lie further than 10 cm, most from 0 to 2 m, where it looks like a train",
+        ),
+        Warned(Code.PLACE, "at 3 m: a train"),
+        Warned(Code.UNSEEN, "a guess"),
+    ]
+    texts = [one.text for one in blame_poses(said)]
+    assert texts == ["7% lie further than 10 cm; the poses, or their clock, scatter them", "a guess"]

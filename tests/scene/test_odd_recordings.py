@@ -98,6 +98,12 @@ def test_odd_control_ends_in_one_sentence(tmp_path, name):
     assert said in outcome(bag, write_tum(tmp_path / "prism.tum", rows))
 
 
+def test_control_without_an_imu_says_what_is_missing(tmp_path):
+    bag = clouds(tmp_path / "a.bag", 5 + 0.1 * np.arange(40))
+    rows = np.column_stack([5 + 0.1 * np.arange(40.0)] + [np.arange(40.0)] * 3)
+    assert "control goes with an IMU whose mount is known" in outcome(bag, write_tum(tmp_path / "prism.tum", rows))
+
+
 @pytest.mark.parametrize("count", [0, 49])
 def test_too_few_inertial_samples_are_no_imu(tmp_path, count):
     with Recording(write_imu_bag(tmp_path / "a.bag", XYZ, count)) as recording:

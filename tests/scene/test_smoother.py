@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from scene.errors import FitError
 from scene.poses.imu import integrals
-from scene.poses.smoother import Noise, inertial_problem, means_between, odometry_problem, solve_with_heading
+from scene.poses.smoother import Noise, inertial_problem, means_between, solve_with_heading
 from scene.poses.terms import KNOT_SIZE, Chain, Motion, NormalEquations, Sightings, Steps, add_motion
 from tests.scene import walks
 
@@ -44,24 +44,6 @@ def test_a_control_row_that_is_wrong_by_a_metre_moves_the_trajectory_by_millimet
     assert np.abs(off).max() < 0.015
 
 
-def test_control_restores_the_length_that_odometry_lost_without_an_imu():
-    odometry, control = walks.slipping_odometry(DURATION), walks.control(DURATION)
-    problem, guess = odometry_problem(odometry, control, walks.LEVER, Noise())
-    chain = solve_with_heading(problem, guess)
-    twist, off = errors(chain)
-    lost = odometry.trajectory.positions
-    assert np.linalg.norm(lost[-1] - lost[0]) < 0.6 * DURATION
-    assert np.sqrt(np.mean(off**2)) < 0.01
-    assert np.sqrt(np.mean(twist**2, axis=0)).max() < 0.5
-
-
-def test_odometry_outside_the_time_of_the_control_is_an_error():
-    odometry, control = walks.slipping_odometry(DURATION), walks.control(DURATION)
-    with pytest.raises(FitError, match=r"prism\.tum: only 0 sweeps"):
-        odometry_problem(odometry, type(control)(control.times + 1e4, control.positions, control.path, 0),
-                         walks.LEVER, Noise())  # fmt: skip
-
-
 def test_samples_are_integrated_by_the_trapezium_rule():
     times, values = np.array([0.0, 1.0, 3.0]), np.array([[0.0, 1.0, 2.0], [1.0, 1.0, 0.0], [3.0, 1.0, 0.0]])
     np.testing.assert_allclose(integrals(times, times, values), [[0, 0, 0], [0.5, 1, 1], [4.5, 3, 1]])
@@ -89,9 +71,7 @@ def terms():
     chain = small_chain()
     turn = chain.attitude[:-1].mT @ chain.attitude[1:]
     unit = np.broadcast_to(np.eye(3), (3, 3, 3))
-    motion = Motion(
-        rng.standard_normal((3, 3)) * 0.1, rng.standard_normal((3, 3)) + np.array([0, 0, 9.8]), 1.0, 1.0, True
-    )
+    motion = Motion(rng.standard_normal((3, 3)) * 0.1, rng.standard_normal((3, 3)) + np.array([0, 0, 9.8]), 1.0, 1.0)
     seen = Sightings(np.array([0, 1, 2]), np.array([0.0, 0.5, 0.9]), chain.position[:3], walks.LEVER, 1.0)
     steps = Steps(*ends, turn, rng.standard_normal((3, 3)), unit, unit)
     return {

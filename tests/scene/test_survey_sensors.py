@@ -11,6 +11,7 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from scene.poses.calibration import PRESETS, load_calibration
+from scene.poses.imu import imu_samples
 from scene.reading.recording import Recording
 from scene.survey import simulate
 from scene.survey.config import SensorErrors
@@ -83,6 +84,19 @@ def test_returns_lie_on_the_truth_as_the_builder_reads_them(
     assert close.mean() > 0.997
     assert 0.0185 < error[close].std() < 0.0215
     assert error[close].mean() == pytest.approx(0.0, abs=6e-4)
+
+
+def test_a_survey_in_another_convention_is_the_same_drive(folder: Path, tmp_path: Path) -> None:
+    words = ("--point-times", "boot", "--point-unit", "ns", "--container", "mcap", "--bags", 2, "--imu-late", 0.5)
+    other = make(tmp_path, "--sensors", "vlp16", *words)
+    with Recording(folder / "survey_vlp16.bag") as one, Recording(other / "survey_vlp16") as two:
+        pairs = list(zip(one.scans(), two.scans(), strict=True))
+        starts = [next(row[0] for row in imu_samples(recording, "/imu/data")) for recording in (one, two)]
+        assert "absolute by another clock, ns" in two.facts["point_times"]
+    apart = np.concatenate([b.stamp + b.times - a.stamp - a.times for a, b in pairs])
+    np.testing.assert_allclose(apart, np.median(apart), atol=2e-5)
+    np.testing.assert_array_equal(pairs[3][0].points, pairs[3][1].points)
+    assert starts[1] - starts[0] == pytest.approx(0.5, abs=1e-6)
 
 
 def test_a_velodyne_sweep_is_stamped_at_its_end(folder: Path) -> None:

@@ -14,7 +14,7 @@ from scene.reading.formats import ReadingConfig, detect
 from scene.reading.ringsurvey import read_ring_survey
 from scene.writing.folder import Reconstruction
 from tests.scene.clouds import curved_d_bore
-from tests.scene.files import write_e57, write_las, write_parquet, write_ply, write_text
+from tests.scene.files import write_e57, write_las, write_ply, write_text
 
 KNOWN = curved_d_bore(length=24, per_metre=4000, offset=(12.0, -3.0, 2.0))
 
@@ -116,8 +116,6 @@ def test_columns_that_the_user_names_are_read(tmp_path, columns):
     path.write_text("Id,A,B,C\n" + "\n".join(",".join(f"{v:.5f}" for v in row) for row in rows))
     cloud, _ = read_cloud(path, 1e-3, ReadingConfig(columns=columns))
     np.testing.assert_allclose(np.ptp(cloud.points, axis=0), np.ptp(rows[:, 1:], axis=0), atol=1e-3)
-    parquet = write_parquet(tmp_path / "a.parquet", rows[:, 1:], ("A", "B", "C"))
-    assert len(read_cloud(parquet, 1e-3, ReadingConfig(columns="x=A,y=B,z=C"))[0].points) == 60
 
 
 @pytest.mark.parametrize(

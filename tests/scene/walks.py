@@ -1,4 +1,4 @@
-"""A walk whose every derivative is known: what an IMU, a total station and an odometry would report of it."""
+"""A walk whose every derivative is known: what an IMU and a total station would report of it."""
 
 from pathlib import Path
 
@@ -6,8 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from scene.poses.imu import GRAVITY, Inertial
-from scene.poses.odometry import Odometry
-from scene.poses.trajectory import Control, Trajectory
+from scene.poses.trajectory import Control
 
 LEVER = np.array([0.1, -0.3, 0.35])
 
@@ -38,18 +37,3 @@ def control(duration: float, mounted: float = 0.0, sigma: float = 0.0005) -> Con
     places = position(times) + attitude(times, mounted).apply(LEVER)
     noise = sigma * np.random.default_rng(0).standard_normal(places.shape)
     return Control(times, places + noise, Path("prism.tum"), 0)
-
-
-def slipping_odometry(duration: float) -> Odometry:
-    """True attitude and true shifts across, but half the shift along the bore; from the origin."""
-    times = np.arange(0.05, duration, 0.1)
-    turns, places = attitude(times), position(times)
-    axis = Rotation.from_euler("z", (0.3 + 0.01 * times)[:, None]).apply([1.0, 0.0, 0.0])
-    steps = np.diff(places, axis=0)
-    steps -= 0.5 * np.sum(steps * axis[:-1], axis=1, keepdims=True) * axis[:-1]
-    start = turns[0].inv()
-    seen = start.apply(np.vstack([np.zeros(3), np.cumsum(steps, axis=0)]))
-    # Level, but of unknown heading, as gravity leaves it.
-    level = Rotation.from_euler("z", -turns[0].as_euler("ZYX")[0])
-    trajectory = Trajectory(times, (level * turns[0]).apply(seen), level * turns, "odometry")
-    return Odometry(trajectory, turns.inv().apply(axis))

@@ -6,6 +6,7 @@ import pickle
 import pkgutil
 import subprocess
 import sys
+import warnings
 
 import pytest
 import tyro
@@ -118,6 +119,10 @@ def fail(error: BaseException):
 def test_a_command_ends_with_its_own_status_or_0():
     assert run_command(lambda: None) == 0
     assert run_command(lambda: 7) == 7
+    with warnings.catch_warnings(record=True) as shown:
+        warnings.simplefilter("always")
+        run_command(lambda: warnings.warn("Mean of empty slice", RuntimeWarning, stacklevel=1))
+    assert not shown, "a warning of a library reached the user"
 
 
 @pytest.mark.parametrize(
