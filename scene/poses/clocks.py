@@ -26,7 +26,7 @@ _SWEEPS, _FEWEST = 100, 40  # that are matched one to the next; with fewer nothi
 _PASSES = 3  # times that they are matched: each unwinds sweeps by the motion that the last one found
 _POINTS = 6_000  # of a sweep
 _WARM_UP = 8  # sweeps that are left out: the map is too thin for them
-_REACH, _STEP = 1.5, 0.005  # s: largest lag that is tried, and between two lags
+_REACH, _COARSE, _STEP = 1.5, 0.02, 0.005  # s: largest lag that is tried, and between two lags, far and near
 _AGREE = 0.8  # correlation of turn rates from which a lag counts
 _LIVELY = 0.03  # rad/s, mean size less the mean; a carrier that turns more evenly tells no lag
 _LONGEST = 3.0  # times the median size
@@ -96,14 +96,17 @@ def find_lag(lidar: LidarTurns, other: Turns) -> float | None:
     own = _even(lidar.rate)
     if float(np.linalg.norm(own, axis=1).mean()) < _LIVELY:
         return None
-    lags = np.arange(-round(_REACH / _STEP), round(_REACH / _STEP) + 1) * _STEP
-    agree = np.array([_agreement(own, _even(other(lidar.start + lag, lidar.end + lag))) for lag in lags])
-    best = int(np.argmax(agree))
-    if agree[best] < _AGREE or best in (0, len(lags) - 1):
+
+    def agree(lag: float) -> float:
+        return _agreement(own, _even(other(lidar.start + lag, lidar.end + lag)))
+
+    near = max(np.arange(-_REACH, _REACH + _COARSE, _COARSE), key=agree)
+    best = max(near + _STEP * np.arange(-4, 5), key=agree)
+    before, here, after = (agree(best + side) for side in (-_STEP, 0.0, _STEP))
+    if here < _AGREE or abs(best) >= _REACH:
         return None
-    before, here, after = agree[best - 1 : best + 2]
     bend = before - 2.0 * here + after
-    return float(lags[best] + (0.5 * _STEP * (before - after) / bend if bend < 0 else 0.0))
+    return float(best + (0.5 * _STEP * (before - after) / bend if bend < 0 else 0.0))
 
 
 def _even(rate: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3"]:

@@ -58,6 +58,7 @@ class Beside:
     """A recording of the same drive, as far as its clock counts."""
 
     path, topic, scan_count, stamps = "a.bag", "/points", 0, np.array([0.0, 30.0])
+    convention = Convention("after", "")
 
     def pick(self, numbers):
         return iter(())
