@@ -23,7 +23,7 @@ _OVER_PERIOD, _UNSURE = 1.2, 5.0  # times the period: longest sweep; up to which
 _LEAST_SWEEP = 0.005  # of the period: a shorter sweep makes the unit unsure
 _GROWS = 0.5  # of the span of a sweep, by which the times of the next one are later: they are absolute
 _EVEN = 0.02  # s of spread about one offset between two clocks; with more the headers rule
-_WIDE = 1.5  # times the length of a sweep from its middle: further is no time of that sweep
+_WIDE = 1.5  # times the reach of a sweep from its middle: further is no time of that sweep
 MOST_BAD = 0.05  # share of all points without a time of their sweep
 _SAMPLE = 4000  # points of a sweep by which its span is told
 _MOST, _AROUND = 0.85, 3.0  # share of the points that lie about the median; how much further a time of theirs may lie
@@ -95,7 +95,8 @@ class Convention:
     kind: Literal["static", "after", "same clock", "other clock"]
     words: str  # For people, with the evidence
     scale: float = 1.0  # s
-    length: float = _LONGEST_SWEEP  # Of a sweep, s
+    length: float = _LONGEST_SWEEP  # Of a sweep, as far as it met something, s
+    reach: float = _LONGEST_SWEEP  # Of a sweep at most, s
     reference: Literal["start", "end"] | None = None  # Part of a sweep that its header is of, where somebody says so
     guessed: bool = False  # True where nothing tells whether a header is of the start or the end of its sweep
     offset: float | None = None  # Of the headers' clock before the points', s; `None` where each header tells its own
@@ -110,7 +111,7 @@ class Convention:
         values, good = _unwrap(raw.values)
         if not good.any():
             return Scan(stamp, raw.points[:0], np.zeros(0)), len(good)
-        good &= np.abs(values - np.median(values[good])) * self.scale <= _WIDE * self.length
+        good &= np.abs(values - np.median(values[good])) * self.scale <= _WIDE * self.reach
         points, values = raw.points[good], values[good]
         start, times = self._place(stamp, values * self.scale)
         if (np.diff(times) < 0).any():
@@ -205,7 +206,8 @@ class Spans:
         found = decide(stamp, low, high, told)
         by = f" ({why})" if told.time_unit or told.time_stamp else ""
         length = max(float(np.quantile(spans, _LONG)) * found.scale, 1e-9)
-        return replace(found, words=found.words + by + note, by_receipt=by_receipt, length=length)
+        reach = max(length, float(np.fmin(_usual_step(stamp), _LONGEST_SWEEP)))
+        return replace(found, words=found.words + by + note, by_receipt=by_receipt, length=length, reach=reach)
 
     def _decide_relative(self, stamp: np.ndarray, low: np.ndarray, high: np.ndarray, told: TimeConfig) -> Convention:
         span, period = float(np.median(high - low)), _usual_step(stamp)

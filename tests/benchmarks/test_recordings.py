@@ -26,7 +26,7 @@ def test_every_kind_is_drawn_and_the_same_number_draws_the_same():
 def drive(tmp_path_factory):
     folder = tmp_path_factory.mktemp("drive")
     whole = drive_through(RecordingsConfig(), folder)
-    return folder, replace(whole, sweeps=whole.sweeps[40:100])
+    return folder, replace(whole, sweeps=whole.sweeps[90:150])
 
 
 CASES = {
@@ -47,6 +47,14 @@ def test_a_recording_is_read_as_it_was_written(drive, name):
     case, outcome = CASES[name]
     row = read_case(one, case, write_case(one, case, folder / "a.bag"))
     assert row.outcome == outcome, row.said
+
+
+@pytest.mark.slow
+def test_a_lidar_before_the_mouth_that_meets_little_loses_nothing(tmp_path):
+    whole = drive_through(RecordingsConfig(), tmp_path)
+    one, case = replace(whole, sweeps=whole.sweeps[:60]), Case(Convention(), "nothing", 0.0)
+    row = read_case(one, case, write_case(one, case, tmp_path / "a.bag"))
+    assert row.outcome == "as control", row.said
 
 
 @pytest.mark.slow
