@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from subterra_jax.adapters.packing import take_key
+from subterra_jax.adapters.kernel import take_key
 from subterra_jax.host.errors import MissingLibraryError
 from subterra_jax.state import EnvParams
 from subterra_jax.tasks import make

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from subterra_jax.adapters.packing import Observation, as_observation
+from subterra_jax.adapters.kernel import Observation, as_observation
 from subterra_jax.adapters.vector import SubterraVectorEnv
 from subterra_jax.host.errors import MissingLibraryError
 

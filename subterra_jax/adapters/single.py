@@ -6,7 +6,7 @@ import numpy as np
 from gymnasium.core import Env
 
 from subterra_jax.adapters.choosing import check_clear, read_choice
-from subterra_jax.adapters.packing import Observation, as_observation, start_streams
+from subterra_jax.adapters.kernel import Observation, as_observation, start_streams
 from subterra_jax.adapters.task import Door, Task, open_task, refuse_fork
 from subterra_jax.pictures.views import View
 from subterra_jax.state import State

@@ -8,8 +8,17 @@ import jax
 import numpy as np
 from gymnasium import error, spaces
 
-from subterra_jax.adapters.kernel import Compile, Programs, compile_with_params, first_cpu, programs_of
-from subterra_jax.adapters.packing import Fields, Report, as_observation, unpacker
+from subterra_jax.adapters.kernel import (
+    Compile,
+    Fields,
+    Programs,
+    Report,
+    as_observation,
+    compile_with_params,
+    first_cpu,
+    programs_of,
+    unpacker,
+)
 from subterra_jax.env import Box
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.parts.spatial_lidar import SENSORS

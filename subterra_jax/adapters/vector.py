@@ -16,7 +16,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from jaxtyping import Array, Bool, Float
 
-from subterra_jax.adapters.packing import (
+from subterra_jax.adapters.kernel import (
     Fields,
     Observation,
     Report,

@@ -7,8 +7,7 @@ from typing import Any
 
 import jax
 
-from subterra_jax.adapters.kernel import first_cpu
-from subterra_jax.adapters.packing import Observation
+from subterra_jax.adapters.kernel import Observation, first_cpu
 from subterra_jax.adapters.single import SubterraEnv
 from subterra_jax.adapters.task import Task, check_mode
 from subterra_jax.b2 import tasks

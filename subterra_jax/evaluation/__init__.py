@@ -1,6 +1,6 @@
 """Scores of an agent on fixed episodes.
 
-episodes (seeds) ─► harness (drive) ─► tally (running sums) ─► records (one each; means, intervals, normalised)
+episodes (seeds) ─► harness (drive) ─► records (running sums, one record each, means and intervals)
 """
 
 from subterra_jax.evaluation.episodes import Episodes, listed_episodes

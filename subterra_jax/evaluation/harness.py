@@ -10,8 +10,7 @@ from jaxtyping import Array
 from subterra_jax.baselines.agent import Agent
 from subterra_jax.episode import Driver, Episode, Taken
 from subterra_jax.evaluation.episodes import Episodes, EvaluationError
-from subterra_jax.evaluation.records import Records, make_records
-from subterra_jax.evaluation.tally import Tally, add_step, start_tally
+from subterra_jax.evaluation.records import Records, Tally, add_step, make_records, start_tally
 from subterra_jax.policies import DrivingPolicy, check_task
 from subterra_jax.policies.trained import Trained
 from subterra_jax.state import EnvParams, State

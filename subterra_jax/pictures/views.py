@@ -11,7 +11,7 @@ from subterra_jax.lidar3d.beams import level_ring
 from subterra_jax.parts.boxes import Boxes
 from subterra_jax.parts.spatial_lidar import SENSORS
 from subterra_jax.pictures.camera import FollowCamera, TunnelChoice
-from subterra_jax.pictures.carrier import add_carrier
+from subterra_jax.pictures.stage import add_carrier
 from subterra_jax.pictures.top_down import top_down, wall_points
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tasks import TASKS, find, is_planar, tunnel_for

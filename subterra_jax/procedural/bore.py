@@ -10,9 +10,8 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from subterra_jax.procedural.fixtures import Bench, Boxes, draw_benches, draw_boxes, overlaps
+from subterra_jax.procedural.fixtures import Bench, Boxes, Mount, Section, draw_benches, draw_boxes, overlaps
 from subterra_jax.procedural.kinds import Kind, PocketRanges
-from subterra_jax.procedural.section import Mount, Section
 from subterra_jax.procedural.surfaces import Grid, Layer, Rings, draw_layers
 
 N_ANGLES = 180

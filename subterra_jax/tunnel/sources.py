@@ -19,7 +19,7 @@ import numpy as np
 from subterra_jax.host.errors import TunnelError
 from subterra_jax.host.files import cache_folder, make_writable, replace_file
 from subterra_jax.procedural import GENERATED, default_lining, expand, generate
-from subterra_jax.procedural.control import NAME as CONTROL
+from subterra_jax.procedural import NAME as CONTROL
 from subterra_jax.procedural.open_world import in_benchmark
 from subterra_jax.tunnel.file import read_tunnel
 from subterra_jax.tunnel.plan import TunnelPlan

@@ -20,7 +20,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from subterra_jax.host.files import replace_file
-from subterra_jax.pictures.carrier import carrier_parts
+from subterra_jax.pictures.stage import carrier_parts
 from subterra_jax.viewer.chart import ESTIMATE, ODOMETRY, TRUTH, error_chart, rgb
 from subterra_jax.viewer.episode import ON_GROUND, Drawn
 from subterra_jax.viewer.shapes import Shape

@@ -16,8 +16,15 @@ from subterra_jax.baselines.registry import AgentError, make_agent, register
 from subterra_jax.evaluation import Records, evaluate, listed_episodes
 from subterra_jax.evaluation import episodes as lists
 from subterra_jax.evaluation.episodes import EvaluationError
-from subterra_jax.evaluation.records import area, interquartile_mean, interval, summarise
-from subterra_jax.evaluation.tally import add_estimate, crps, start_estimates
+from subterra_jax.evaluation.records import (
+    add_estimate,
+    area,
+    crps,
+    interquartile_mean,
+    interval,
+    start_estimates,
+    summarise,
+)
 from subterra_jax.rules import GoalParams
 from tests.subterra_jax import tunnels
 

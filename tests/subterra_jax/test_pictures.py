@@ -6,8 +6,7 @@ from scipy.spatial import KDTree
 
 import subterra_jax as st
 from subterra_jax.pictures.camera import TunnelChoice
-from subterra_jax.pictures.carrier import carrier_parts
-from subterra_jax.pictures.stage import Piece, stage_spec
+from subterra_jax.pictures.stage import Piece, carrier_parts, stage_spec
 from subterra_jax.pictures.surfaces import short_shell, tunnel_surfaces
 from tests.subterra_jax.drawn import draw
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from subterra_jax.adapters.packing import as_observation
+from subterra_jax.adapters.kernel import as_observation
 from subterra_jax.adapters.single import SubterraEnv
 from subterra_jax.adapters.task import Task
 from subterra_jax.parts import make_sensor

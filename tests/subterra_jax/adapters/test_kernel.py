@@ -5,8 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from subterra_jax.adapters.kernel import compile_as_one_kernel
-from subterra_jax.adapters.packing import pack, start_streams, unpacker
+from subterra_jax.adapters.kernel import compile_as_one_kernel, pack, start_streams, unpacker
 
 
 def test_packing_keeps_every_bit():

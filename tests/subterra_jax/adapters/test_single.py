@@ -15,7 +15,7 @@ from gymnasium.utils.env_checker import check_env
 
 import subterra_jax as st
 from subterra_jax.adapters import register_tasks
-from subterra_jax.adapters.packing import start_streams, take_key
+from subterra_jax.adapters.kernel import start_streams, take_key
 from subterra_jax.adapters.single import SubterraEnv
 
 TASK, FURTHER = "Subterra/TraverseShort-v1", "Subterra/Relocalise-v1"

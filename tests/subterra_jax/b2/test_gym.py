@@ -14,7 +14,7 @@ import pytest
 from gymnasium.error import ResetNeeded
 
 import subterra_jax as st
-from subterra_jax.adapters.packing import pack
+from subterra_jax.adapters.kernel import pack
 from subterra_jax.b2 import mission, tasks
 from subterra_jax.b2.model import RobotError
 from subterra_jax.b2.params import CommandParams
