@@ -10,7 +10,7 @@ import subterra_jax as st
 from benchmarks import reference
 from subterra_jax.procedural.geometry import Alignment, draw_alignment, wander
 from subterra_jax.procedural.open_world import LINE
-from subterra_jax.tunnel import kept, sources
+from subterra_jax.tunnel import sources
 from subterra_jax.tunnel.sources import resolve
 
 
@@ -146,7 +146,7 @@ def test_a_tunnel_is_made_once_and_then_read(tmp_path, monkeypatch):
         np.testing.assert_array_equal(one, other)
         assert isinstance(other, jax.Array)
     afresh(length=61.0)  # another piece is another tunnel
-    monkeypatch.setattr(kept, "_code", lambda: "other code")
+    monkeypatch.setattr(sources, "_code", lambda: "other code")
     afresh()
     assert len(made) == 3
 
@@ -168,6 +168,6 @@ def test_the_cache_does_without_a_folder_survives_damage_and_does_not_grow_for_e
     (file,) = (tmp_path / "subterra" / "tunnels").glob("*.pickle")
     file.write_bytes(file.read_bytes()[:100])
     assert afresh().count == 1
-    monkeypatch.setattr(kept, "MOST", file.stat().st_size + 10)
+    monkeypatch.setattr(sources, "_MOST", file.stat().st_size + 10)
     afresh("open:cast:val:6")
     assert len(list(file.parent.glob("*.pickle"))) == 1
