@@ -154,7 +154,7 @@ def test_a_tunnel_is_made_once_and_then_read(tmp_path, monkeypatch):
 def test_what_a_process_has_made_it_has_again_even_if_the_first_was_given_away(monkeypatch):
     first = afresh()
     length = float(first.length)
-    monkeypatch.setattr(sources, "keep", None)
+    monkeypatch.setattr(sources, "_kept", None)
     jax.tree.map(lambda leaf: leaf.delete(), first)
     assert float(resolve("open:cast:val:5", None, (0.0, 60.0), 30.0).length) == length
 
