@@ -6,6 +6,7 @@ NumPy on the host, sharing no code with the casting on the device; slow. The tes
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from functools import partial
 
 import jax
@@ -15,7 +16,6 @@ from subterra_jax import lidar
 from subterra_jax.state import EnvParams
 from subterra_jax.tunnel import Tunnel
 from subterra_jax.tunnel.plan import TunnelPlan
-from subterra_jax.tunnel.sources import load_tunnel
 
 # Numbers in one chunk of the table of rays by points; small enough to stay in a processor's cache.
 _CHUNK = 200_000
@@ -192,39 +192,24 @@ def random_poses(
     return Poses(*(value.astype(np.float32) for value in (position, heading, station)))
 
 
-def measure_exactness(plan: TunnelPlan, lining: str, params: EnvParams, n_poses: int, seed: int) -> Agreement:
+def measure_exactness(
+    plans: Sequence[TunnelPlan], lining: str | None, params: EnvParams, n_poses: int, seed: int
+) -> Agreement:
     """Compares the LiDAR on this device with float64 brute force over every segment of the same walls.
 
     Args:
-        plan: Whole tunnel.
-        lining: Variant of its walls.
-        params: Params of an environment made of that plan and lining.
-        n_poses: Random poses, 16 rays each.
-        seed: Seed for the poses.
-    """
-    poses = random_poses(plan, n_poses, np.random.default_rng(seed))
-    ranges = simulate(params.tunnel, poses, params.lidar)
-    return agreement(plan.lining(lining).segments, poses, ranges)
-
-
-def measure_exactness_of_many(
-    names: list[str], lining: str | None, params: EnvParams, n_poses: int, seed: int
-) -> Agreement:
-    """Compares the LiDAR in several tunnels that are in memory together, each as `measure_exactness` does.
-
-    Args:
-        names: Names of the tunnels.
+        plans: Whole tunnels.
         lining: Variant of their walls; None is the usual one of each.
         params: Params of an environment made of these tunnels, in this order.
-        n_poses: Random poses, spread over the tunnels.
+        n_poses: Random poses, spread over the tunnels, 16 rays each.
         seed: Seed for the poses.
     """
     found = []
-    for index, name in enumerate(names):
-        plan, here = load_tunnel(name), params.replace(tunnel=params.tunnel.pick(index))
-        found.append(
-            measure_exactness(plan, lining or plan.default_lining, here, -(-n_poses // len(names)), seed + index)
-        )
+    for index, plan in enumerate(plans):
+        poses = random_poses(plan, -(-n_poses // len(plans)), np.random.default_rng(seed + index))
+        tunnel = params.tunnel.pick(index) if len(plans) > 1 else params.tunnel
+        segments = plan.lining(lining or plan.default_lining).segments
+        found.append(agreement(segments, poses, simulate(tunnel, poses, params.lidar)))
     return Agreement(
         n_rays=sum(each.n_rays for each in found),
         max_error=max(each.max_error for each in found),

@@ -19,7 +19,7 @@ from PIL import Image
 
 from benchmarks.draw.scene import picture
 from benchmarks.results import png_bytes
-from benchmarks.truth import Comparison, Truth, centreline, compare, scene_points
+from benchmarks.truth import Truth, centreline, scene_points
 from subterra_jax.host.tunnelfile import read_fields
 from subterra_jax.pictures.renderer import PictureError
 
@@ -131,20 +131,6 @@ def section_overlays(bore_path: Path, points: Float[np.ndarray, "p 3"], count: i
     return figure
 
 
-def section_errors(comparison: Comparison) -> Figure:
-    """Draws the errors of the axis and of the section's size along the tunnel."""
-    figure, (upper, lower) = plt.subplots(2, 1, figsize=(11, 4), sharex=True, layout="constrained")
-    for axes, names in ((upper, ("lateral", "vertical")), (lower, ("width", "height"))):
-        for name, colour in zip(names, (_INK, _SECOND), strict=True):
-            axes.plot(comparison.station, 100 * getattr(comparison, name), color=colour, lw=1.2, label=name)
-        axes.axhline(0, color="0.6", lw=0.8)
-        axes.set_ylabel("error, cm")
-        axes.legend(fontsize=8, loc="upper right")
-        axes.grid(alpha=0.3)
-    lower.set_xlabel("station, m")
-    return figure
-
-
 def plan_of_walls(tunnel_path: Path, lining: str = "pockets", stretch: float = 20.0) -> Figure:
     """Draws the first metres of the planar tunnel from above, as the environment's LiDAR sees them."""
     tunnel = read_fields(tunnel_path)
@@ -235,12 +221,10 @@ def _bore_parts(out: Path, truth: Truth) -> list[str]:
         view = html_text(f"No picture of the scene: {error}")
     line = "Plan and profile of the centreline; nothing is aligned."
     sections = "Sections over the registered points within 15 cm, looking along the tunnel."
-    errors = "Error of the axis (above) and of the section's size (below) against the truth."
     return [
         view,
         html_figure(plan_and_profile(truth, centreline(scene)), line),
         html_figure(section_overlays(scene / "bore.npz", scene_points(scene)), sections),
-        html_figure(section_errors(compare(scene, truth)), errors),
     ]
 
 

@@ -17,7 +17,6 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.figure import Figure
 
-from subterra_jax import tasks
 from subterra_jax.host.files import replace_file
 
 UNKNOWN = "unknown"
@@ -47,12 +46,6 @@ def commit() -> str:
         return subprocess.run(words, capture_output=True, text=True, check=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         return UNKNOWN
-
-
-def constants_facts() -> dict[str, str]:
-    """Returns the digest of the benchmark's constants; empty where `subterra_jax.tasks` has none to give."""
-    digest = getattr(tasks, "constants_digest", None)
-    return {} if digest is None else {"constants_sha256": str(digest())}
 
 
 def version(package: str) -> str | None:

@@ -62,7 +62,7 @@ def _shared_context() -> object:
 
 mlir.make_ir_context = _shared_context  # type: ignore[assignment]
 
-_CROWDED = 2.5e9
+_CROWDED = 4e9
 _MANY_PROGRAMS = 25
 _COMPILED = "/jax/core/compile/backend_compile_duration"
 _since_looked = 0

@@ -13,7 +13,7 @@ from rich.console import Console
 import subterra_jax as st
 from benchmarks.command import BenchmarkError, run_main
 from benchmarks.records import write_records
-from benchmarks.reference import measure_exactness, measure_exactness_of_many
+from benchmarks.reference import measure_exactness
 from benchmarks.results import environment_facts, write_file
 from benchmarks.throughput import report
 from benchmarks.throughput.config import ThroughputConfig, check
@@ -29,7 +29,7 @@ _progress = Console(stderr=True, highlight=False, emoji=False)
 
 
 def run(config: ThroughputConfig) -> report.Result:
-    """Measures everything that the settings ask for.
+    """Measures everything that the settings ask for: in one tunnel, beside JaxNav, or in several, one an episode.
 
     Raises:
         SubterraError: A tunnel, lining or peer is missing, or a setting is out of range.
@@ -39,71 +39,36 @@ def run(config: ThroughputConfig) -> report.Result:
     check(config)
     if config.out is not None:
         require_folder(config.out)
-    names = [config.tunnel] if config.tunnel is None else tunnels.names_of(config.tunnel)
-    return run_one(config) if len(names) * config.copies == 1 else run_many(config, names)
-
-
-def run_one(config: ThroughputConfig) -> report.Result:
-    """Measures in one tunnel, beside JaxNav."""
+    names: list[Any] = [first_tunnel(config.task)] if config.tunnel is None else tunnels.names_of(config.tunnel)
+    count = len(names) * config.copies
     if config.peers == "jaxnav":
+        if count > 1:
+            raise BenchmarkError(f"--peers jaxnav takes one tunnel, and there are {count}")
         require_jaxnav()
-    plan = st.load_tunnel(config.tunnel or first_tunnel(config.task))
-    lining = config.lining or plan.default_lining
-    env, params = st.make(config.task, plan, lining, sensor=config.sensor)
-    segments = len(plan.lining(lining).segments)
-    facts = {"name": plan.name, "length": plan.length, "lining": lining, "segments": segments}
-    result, timing = _begin(config, facts, params)
-    if config.poses:
-        _progress.print(f"exactness: {config.poses:,} poses")
-        # The comparison with the reference uses the whole tunnel, whichever piece the task uses.
-        whole = st.make(_WHOLE, plan, lining)[1]
-        result.exactness = measure_exactness(plan, lining, whole, config.poses, config.seed)
-    _measure_speeds(result, env, params, timing)
-    if config.peers != "none":
-        result.peers.append(measure_jaxnav(config.sizes(), timing, _progress.print))
-    return result
-
-
-def run_many(config: ThroughputConfig, names: list[Any]) -> report.Result:
-    """Measures in several tunnels at once, one drawn each episode; the LiDAR is compared in the first few of them.
-
-    Raises:
-        BenchmarkError: Something is asked for that takes one tunnel.
-    """
-    if config.peers == "jaxnav":
-        raise BenchmarkError(f"--peers jaxnav takes one tunnel, and there are {len(names) * config.copies}")
-    _progress.print(f"{len(names)} tunnels")
-    made = tunnels.load(names, config.lining)
-    env, params = st.make(config.task, tunnel=made * config.copies, sensor=config.sensor)
-    lengths = np.broadcast_to(np.asarray(params.tunnel.length), (params.tunnel.count,))
+    plans = [st.load_tunnel(name) for name in names[:_COMPARED]]
+    made: Any = tunnels.load(names, config.lining) if count > 1 else plans[0]
+    lining = config.lining if count == 1 else None  # what is made already has its lining
+    env, params = st.make(config.task, made * config.copies if count > 1 else made, lining, sensor=config.sensor)
     facts = {
-        "name": config.tunnel or "packaged",
-        "tunnels": params.tunnel.count,
-        "length": float(lengths.mean()),
-        "lining": config.lining or "the usual one of each",
+        "name": plans[0].name if count == 1 else config.tunnel,
+        "tunnels": count,
+        "length": float(np.mean(np.asarray(params.tunnel.length))),
+        "lining": config.lining or ("the usual one of each" if count > 1 else plans[0].default_lining),
     }
-    result, timing = _begin(config, facts, params)
-    if config.poses:
-        some = names[:_COMPARED]
-        _progress.print(f"exactness: {config.poses:,} poses in the first {len(some)}")
-        whole = st.make(_WHOLE, tunnel=made[: len(some)])[1]
-        result.exactness = measure_exactness_of_many(some, config.lining, whole, config.poses, config.seed)
-    _measure_speeds(result, env, params, timing)
-    return result
-
-
-def _begin(config: ThroughputConfig, facts: dict[str, Any], params: Any) -> tuple[report.Result, Timing]:
-    """Returns the results with nothing measured yet, and how it is timed."""
     n_beams = params.lidar.n_beams if hasattr(params, "lidar") else 0  # the B2 that walks has no LiDAR
     result = report.Result(config, environment_facts(), facts, n_beams)
-    return result, Timing(config.steps, config.repeats, config.seconds, config.seed)
-
-
-def _measure_speeds(result: report.Result, env: Any, params: Any, timing: Timing) -> None:
-    """Measures each batch size."""
-    for n_envs in result.config.sizes():
+    if config.poses:
+        _progress.print(f"exactness: {config.poses:,} poses in {len(plans)}")
+        # The comparison with the reference uses the whole tunnel, whichever piece the task uses.
+        whole = st.make(_WHOLE, made[: len(plans)] if count > 1 else made, lining)[1]
+        result.exactness = measure_exactness(plans, config.lining, whole, config.poses, config.seed)
+    timing = Timing(config.steps, config.repeats, config.seconds, config.seed)
+    for n_envs in config.sizes():
         _progress.print(f"subterra: {n_envs:,} environments")
         result.speeds.append(measure(environment_loop(env, params, n_envs), n_envs, timing))
+    if config.peers != "none" and count == 1:
+        result.peers.append(measure_jaxnav(config.sizes(), timing, _progress.print))
+    return result
 
 
 def run_and_report(config: ThroughputConfig) -> int:

@@ -11,10 +11,10 @@ from rich.table import Table
 
 from benchmarks.records import Record, measured
 from benchmarks.reference import Agreement
-from benchmarks.results import constants_facts
 from benchmarks.throughput.config import ThroughputConfig
 from benchmarks.throughput.loops import N_BEAMS, Peer
 from benchmarks.throughput.timing import Speed
+from subterra_jax.tasks import constants_digest
 
 SCHEMA = "subterra.throughput/3"
 
@@ -43,7 +43,7 @@ def as_json(result: Result) -> str:
         "schema": SCHEMA,
         "config": dataclasses.asdict(result.config),
         "environment": result.environment,
-        **constants_facts(),
+        "constants_sha256": constants_digest(),
         "tunnel": result.tunnel,
         "exactness": None if result.exactness is None else dataclasses.asdict(result.exactness),
         "speed": [_speed(speed, result.n_beams) for speed in result.speeds],
@@ -143,18 +143,18 @@ def format_rate(value: float) -> str:
 
 def records_of(result: Result) -> list[Record]:
     """Return the records of a measurement: `speed/cpu-N` or `speed/step-N` in one tunnel, `speed/K-tunnels` in many."""
-    config, many = result.config, result.tunnel.get("tunnels")
+    config, count = result.config, result.tunnel["tunnels"]
     command = f"benchmarks.throughput {_words(result)}--out out/speed"
     where = f"{config.task.removeprefix('Subterra/')}, {result.tunnel['name']}"
     found = []
-    if result.exactness is not None and not many:
+    if result.exactness is not None and count == 1:
         error, rays = 1e3 * result.exactness.max_error, result.exactness.n_rays
         found.append(
             measured("speed/lidar-error", round(error, 2), "mm", command, split=where, n=rays, bound="at most")
         )
     for speed in result.speeds:
         one = f"{'cpu' if result.environment['platform'] == 'cpu' else 'step'}-{speed.n_envs}"
-        name = one if not many else f"{many}-tunnels" + ("" if speed.n_envs == 65_536 else f"-{speed.n_envs}")
+        name = one if count == 1 else f"{count}-tunnels" + ("" if speed.n_envs == 65_536 else f"-{speed.n_envs}")
         rate = round(1e-6 * speed.quartiles[1], 3)
         found.append(measured(f"speed/{name}", rate, "M steps/s", command, split=where, bound="at least"))
     return found

@@ -43,6 +43,11 @@ def run(params, steps, n=N):
     return kept
 
 
+def each(function, axes):
+    """A function of many robots, compiled as a whole."""
+    return jax.jit(jax.vmap(function, axes))
+
+
 def test_every_severity_is_drawn_alike():
     severity = np.asarray(begun(faults.FaultParams()).severity)
     counts = np.array([(severity == k).sum() for k in range(5)])
@@ -55,19 +60,18 @@ def test_at_severity_0_nothing_is_spoilt():
     state = run(params, 30)[-1]
     draw = jax.random.uniform(jax.random.key(5), (N, faults.n_step_noise(BEAMS)))
     ranges = jnp.full((N, BEAMS), 3.0)
-    spoilt = jax.jit(jax.vmap(faults.spoil, (0, 0, 0, None, None)))(ranges, state, draw, jnp.float32(30.0), params)
+    spoilt = each(faults.spoil, (0, 0, 0, None, None))(ranges, state, draw, jnp.float32(30.0), params)
     np.testing.assert_array_equal(spoilt, ranges)
-    assert not jax.vmap(faults.frozen)(state).any()
-    np.testing.assert_array_equal(jax.vmap(faults.observed, (0, None))(state, params)[:, 0], 30.0)
-    np.testing.assert_array_equal(jax.vmap(faults.grip, (0, None, None))(state, jnp.float32(5.0), params), 1.0)
+    assert not each(faults.frozen, 0)(state).any()
+    np.testing.assert_array_equal(each(faults.observed, (0, None))(state, params)[:, 0], 30.0)
+    np.testing.assert_array_equal(each(faults.grip, (0, None, None))(state, np.float32(5.0), params), 1.0)
 
 
 def test_dust_reflects_the_stated_share_of_beams_somewhere_before_the_wall():
     params = dataclasses.replace(ZERO, dust_rate=0.15)
     draw = jax.random.uniform(jax.random.key(5), (N, faults.n_step_noise(BEAMS)))
-    spoilt = jax.jit(jax.vmap(faults.spoil, (0, 0, 0, None, None)))(
-        jnp.full((N, BEAMS), 3.0), begun(params), draw, jnp.float32(30.0), params
-    )
+    ranges = np.full((N, BEAMS), 3.0, np.float32)
+    spoilt = each(faults.spoil, (0, 0, 0, None, None))(ranges, begun(params), draw, np.float32(30.0), params)
     short = np.asarray(spoilt)[np.asarray(spoilt) < 3.0]
     assert abs(short.size / spoilt.size - 0.15) < 4 * np.sqrt(0.15 * 0.85 / spoilt.size)
     assert abs(short.mean() - 1.5) < 4 * 3.0 / np.sqrt(12 * short.size)
@@ -95,15 +99,17 @@ def test_dropped_beams_are_one_sector_that_reports_the_largest_range():
 def test_observations_are_as_late_as_the_severity_says():
     params = dataclasses.replace(ZERO, delay=4.0)
     state = run(params, 8, n=3)[-1]
-    np.testing.assert_array_equal(jax.vmap(faults.observed, (0, None))(state, params)[:, 0], 4.0)
+    observed = each(faults.observed, (0, None))
+    np.testing.assert_array_equal(observed(state, params)[:, 0], 4.0)
     milder = dataclasses.replace(state, severity=jnp.full(3, 2.0))
-    np.testing.assert_array_equal(jax.vmap(faults.observed, (0, None))(milder, params)[:, 0], 6.0)
+    np.testing.assert_array_equal(observed(milder, params)[:, 0], 6.0)
 
 
 def test_wet_rail_takes_the_stated_share_of_the_speed_in_whole_patches():
     params = dataclasses.replace(ZERO, wet_share=0.3)
     state = jax.tree.map(lambda leaf: leaf[0], begun(params, 1))
-    grip = np.asarray(jax.vmap(faults.grip, (None, 0, None))(state, jnp.arange(0.0, 20_000.0, 2.5), params))
+    places = np.arange(0.0, 20_000.0, 2.5, np.float32)
+    grip = np.asarray(each(faults.grip, (None, 0, None))(state, places, params))
     assert set(np.unique(grip)) == {np.float32(0.7), np.float32(1.0)}
     patches = grip.reshape(-1, 4)
     assert (patches == patches[:, :1]).all()

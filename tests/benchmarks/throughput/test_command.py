@@ -88,7 +88,7 @@ def test_a_lidar_that_is_a_centimetre_off_fails_the_run(monkeypatch, capsys):
     plan, true_scan = st.load_tunnel().slice(0.0, 50.0), reference.lidar.scan
     params = st.make("Subterra/Traverse-v1", plan)[1]
     monkeypatch.setattr(reference.lidar, "scan", lambda *args, **rest: true_scan(*args, **rest) + 0.01)
-    gate = reference.measure_exactness(plan, "pockets", params, 20, seed=0)
+    gate = reference.measure_exactness([plan], "pockets", params, 20, seed=0)
     # Beams that leave through a mouth report the largest range, a centimetre more now.
     assert gate.n_wrong == gate.n_rays == 320
     facts = {"name": "t", "length": 50.0, "lining": "pockets"}
