@@ -96,6 +96,18 @@ def test_dropped_beams_are_one_sector_that_reports_the_largest_range():
     assert out[some].sum(axis=1).max() <= 12
 
 
+@pytest.mark.parametrize(("name", "longest"), [("dropout", 40.0), ("freeze", 30.0)])
+def test_a_fault_begins_as_often_as_its_rate_and_lasts_up_to_its_longest(name, longest):
+    params = dataclasses.replace(ZERO, **{f"{name}_rate": 0.02, f"{name}_steps": longest}, spread=0.0)
+    left = np.stack([np.asarray(getattr(state, f"{name}_left")) for state in run(params, 60)])
+    idle, begins = left[:-1] <= 0.0, (left[:-1] <= 0.0) & (left[1:] > 0.0)
+    assert abs(begins.sum() - 0.02 * idle.sum()) < 4 * np.sqrt(0.02 * idle.sum())
+    np.testing.assert_array_equal(left[1:][~idle], left[:-1][~idle] - 1.0)
+    lengths = left[1:][begins]
+    assert (lengths.min(), lengths.max()) == (1.0, longest)
+    assert abs(lengths.mean() - 0.5 * (longest + 1.0)) < 4 * lengths.std() / np.sqrt(lengths.size)
+
+
 def test_observations_are_as_late_as_the_severity_says():
     params = dataclasses.replace(ZERO, delay=4.0)
     state = run(params, 8, n=3)[-1]
