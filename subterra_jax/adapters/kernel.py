@@ -17,9 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray, UInt32
 
-from subterra_jax.adapters.choosing import reset_chosen
 from subterra_jax.compiled import hashable
-from subterra_jax.rules import Choice
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel_env import TunnelEnv
 
@@ -174,8 +172,6 @@ class Programs(NamedTuple):
     """Compiled reset and step, which take and return flat arrays."""
 
     reset: Callable[..., Any]  # from a stream to the stream with the state, and the observation
-    # compiles, at its first call, and returns the program of a reset to a chosen place
-    begin: Callable[[], Callable[..., Any]]
     step: Callable[..., Any]  # from stream with state, and action, to stream with state, and report
     read: Callable[[np.ndarray], Report]  # from a report's words to a report
 
@@ -209,7 +205,7 @@ def programs_of(env: TunnelEnv, params: EnvParams, shapes: tuple[Any, Report], c
 @functools.lru_cache(maxsize=16)
 def _compile_programs(setting: _Setting) -> Programs:
     env, (state, report) = setting.env, setting.shapes
-    stream, number = jax.ShapeDtypeStruct((2,), np.uint32), jax.ShapeDtypeStruct((), np.float32)
+    stream = jax.ShapeDtypeStruct((2,), np.uint32)
     packed, unpack = jax.eval_shape(pack, (stream, state)), unpacker((stream, state))
 
     def reset(params: EnvParams, stream: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -223,15 +219,9 @@ def _compile_programs(setting: _Setting) -> Programs:
         obs, state, reward, terminated, truncated, info = env.step(key, state, action, params)
         return pack((stream, state)), pack(Report(obs, reward, terminated, truncated, info))
 
-    def begin(params: EnvParams, stream: jax.Array, choice: Choice) -> tuple[jax.Array, jax.Array, jax.Array]:
-        key, stream = take_key(stream)
-        obs, state, clear = reset_chosen(env, key, params, choice)
-        return pack((stream, state)), obs, clear
-
     action = jax.ShapeDtypeStruct(env.action_space(setting.params).shape, np.float32)
     return Programs(
         setting.compile(reset, setting.params, stream),
-        functools.cache(lambda: setting.compile(begin, setting.params, stream, Choice(*[number] * 4))),
         setting.compile(step, setting.params, packed, action),
         python_reader(report),
     )

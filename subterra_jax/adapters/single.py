@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 from gymnasium.core import Env
 
-from subterra_jax.adapters.choosing import check_clear, read_choice
 from subterra_jax.adapters.kernel import Observation, as_observation, start_streams
 from subterra_jax.adapters.task import Door, Task, open_task, refuse_fork
 from subterra_jax.pictures.views import View
@@ -51,24 +50,18 @@ class SubterraEnv(Door, Env[Observation, np.ndarray]):
 
         Args:
             seed: Seed of the sequence; `None` goes on with it.
-            options: `goal`: station of the goal, m. `start`: station of the start, m, or a mapping with `station` (m),
-                `lateral` (m to the left of the centreline) and `heading` (rad against the centreline; π faces the
-                mouth). What is left out is drawn as ever. A task that observes its start observes the chosen one, as it
-                is; in the others no observation holds it.
+            options: None, or empty.
 
         Raises:
-            OptionError: The task has no such thing, or the robot cannot stand there.
+            ValueError: There are options.
         """
         refuse_fork()
-        choice = read_choice(self.task_env, self.task_params, options)
+        if options:
+            raise ValueError(f"a reset of {self.task_env.id} takes no options, got {sorted(options)[0]!r}")
         super().reset(seed=seed)
         fresh = seed is not None or self._packed is None
         stream = start_streams([seed], self.np_random)[0] if fresh else np.asarray(self._packed)[:2]
-        if choice is None:
-            packed, obs = self.task.programs.reset(stream)
-        else:
-            packed, obs, clear = self.task.programs.begin()(stream, choice)
-            check_clear(clear, choice)
+        packed, obs = self.task.programs.reset(stream)
         self._packed, self._obs = packed, np.array(obs)
         return as_observation(self._obs, self.task.fields), {}
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import jax
 
-from subterra_jax.adapters.kernel import Observation, first_cpu
+from subterra_jax.adapters.kernel import first_cpu
 from subterra_jax.adapters.single import SubterraEnv
 from subterra_jax.adapters.task import Task, check_mode
 from subterra_jax.b2 import tasks
@@ -64,18 +64,6 @@ class B2Env(SubterraEnv):
 
     def _make(self, task: str, tunnel: Any, lining: str | None, scene: Any, options: dict[str, Any]) -> tuple[Any, Any]:
         return tasks.make_mission(task, tunnel, lining, scene=scene, engine="mujoco", **options)
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
-        """Begin an episode; the same seed begins the same sequence of episodes.
-
-        Raises:
-            ValueError: There are options; a robot on legs takes none.
-        """
-        if options:
-            raise ValueError(f"a reset of {self.task_env.id} takes no options, got {sorted(options)[0]!r}")
-        return super().reset(seed=seed)
 
 
 class B2WalkEnv(B2Env):

@@ -94,7 +94,6 @@ class Rule(abc.ABC):
         errand: What agents are asked to do: `cover` (drive on), `stop` (at the observed `goal`), `return` (to the start
             once the observed `flag` is raised) or `report` (stop and say where).
         reports: The action holds an estimate that counts.
-        chooses_goal: An episode has a goal, which a caller may choose.
         covers: Success is coverage. An evaluation then drives on after success, and counts how far the robot comes.
         needs: Names of the parts that the rule cannot do without.
         streams: Numbers of its random streams at a reset, one key each.
@@ -103,7 +102,6 @@ class Rule(abc.ABC):
     key: ClassVar[str]
     errand: ClassVar[str] = "cover"
     reports: ClassVar[bool] = False
-    chooses_goal: ClassVar[bool] = False
     covers: ClassVar[bool] = False
     needs: ClassVar[tuple[str, ...]] = ()
     streams: ClassVar[tuple[int, ...]] = (0,)

@@ -126,7 +126,6 @@ class StopAt(GoalRule):
 
     key: ClassVar[str] = "stop"
     errand: ClassVar[str] = "stop"
-    chooses_goal: ClassVar[bool] = True
 
     def defaults(self) -> dict[str, Any]:
         return {**super().defaults(), "told": ToldParams()}

@@ -90,6 +90,28 @@ def test_a_chosen_start_is_told_and_keeps_the_distance_of_the_goal():
     assert kept == pytest.approx(float(drawn.goal.station - drawn.goal.told), abs=1e-3)
 
 
+def test_a_heading_counts_where_a_task_draws_the_direction():
+    made, params = st.make("Subterra/Relocalise-v1", tunnel="control")
+    keys = jax.random.split(jax.random.key(0), 16)
+
+    def ahead(key, choice):
+        draws = {**made.draw_reset(key, (), params), "choice": choice}
+        return made.privileged(made.begin(draws, params), params)["heading_cos"]
+
+    both = jax.vmap(ahead, (0, None))
+    assert set(np.sign(both(keys, Choice(station=20.0))).tolist()) == {-1.0, 1.0}
+    np.testing.assert_allclose(both(keys, Choice(station=20.0, heading=0.0)), 1.0, atol=1e-4)
+
+
+@pytest.mark.parametrize(("task", "field"), [("Subterra/Return-v1", "told"), ("Subterra/Relocalise-v1", "station")])
+def test_a_rule_whose_state_depends_on_the_start_brings_it_along(task, field):
+    made, params = st.make(task, tunnel="control")
+    draws = {**made.draw_reset(jax.random.key(0), (), params), "choice": Choice(station=17.0)}
+    state = made.begin(draws, params)
+    assert float(state.station) == pytest.approx(17.0)
+    assert float(getattr(state.goal, field)) == pytest.approx(17.0)
+
+
 def test_an_ablation_may_tell_a_wrong_ring_length():
     told = st.rules.ToldParams(pitch_error=0.01)
     env, params = st.make("Subterra/StopAt-v1", tunnel="subterra-351", told=told)

@@ -93,7 +93,7 @@ import sys
 import gymnasium
 import numpy as np
 env = gymnasium.make("subterra_jax:Subterra/StopAt-v1", tunnel="control", render_mode="rgb_array", view="mujoco")
-env.reset(seed=0, options={"start": 100.0})
+env.reset(seed=0)
 try:
     np.save(sys.argv[1], env.render())
 except Exception as cause:
