@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 from benchmarks.slam.__main__ import command
 from benchmarks.slam.arena import bags, describe, record, sets
 from benchmarks.slam.arena.drives import CARRIERS, REST, measure_wheels
-from benchmarks.slam.arena.dust import draw_dust
 from benchmarks.slam.arena.walls import draw_walls
 from benchmarks.slam.reading import read_samples, sweep_points
 from scene.survey.carrier import ACCEL_BIAS, GRAVITY, Poses
@@ -223,7 +222,7 @@ def test_dust_hides_walls_and_stands_still_before_the_sensor():
                np.zeros((len(ray), 3), np.float32))  # fmt: skip
     shares = []
     for density in (0.1, 1.0):
-        dust = draw_dust(np.random.default_rng(1), density)
+        dust = record.draw_dust(np.random.default_rng(1), density)
         once, again = (dust(np.random.default_rng(k), ray, far).distance for k in (2, 3))
         assert once.max() == 9.0
         assert once.min() > 0.3

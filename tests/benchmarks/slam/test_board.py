@@ -8,7 +8,6 @@ import pytest
 
 from benchmarks.command import BenchmarkError
 from benchmarks.slam import board, board_page, programs
-from benchmarks.slam.arena import bound
 from benchmarks.slam.arena.record import Course, draw_scene
 from benchmarks.slam.board_page import records_of
 from benchmarks.slam.score import reach_of
@@ -16,19 +15,19 @@ from tests.benchmarks.slam.tracks import line, write_axis, write_tum
 
 
 def test_slopes_are_those_of_the_ranges_and_jumps_count_as_noise():
-    shift = bound._PLACES
-    slope, left = bound.fit_slopes(np.column_stack([3.0 - 0.4 * shift, np.where(shift > 0.0, 5.0, 4.0), 0.0 * shift]))
+    shift = board._PLACES
+    slope, left = board.fit_slopes(np.column_stack([3.0 - 0.4 * shift, np.where(shift > 0.0, 5.0, 4.0), 0.0 * shift]))
     np.testing.assert_allclose(slope[[0, 2]], [-0.4, 0.0], atol=1e-12)
     np.testing.assert_allclose(left[[0, 2]], 0.0, atol=1e-12)
     assert left[1] > 0.05
 
 
 def test_the_dial_tells_more_the_rougher_the_walls(monkeypatch):
-    monkeypatch.setattr(bound, "_SWEEPS", 2)
+    monkeypatch.setattr(board, "_SWEEPS", 2)
     found = {}
     for walls in ("smooth", "joints", "furnished"):
         scene = draw_scene(Course("one", walls, distance=10.0), np.random.SeedSequence(2))
-        found[walls] = bound.find_floor(scene)
+        found[walls] = board.find_floor(scene)
     assert found["smooth"].sweep > 3.0 * found["joints"].sweep
     assert found["joints"].sweep > 3.0 * found["furnished"].sweep
     one = found["joints"]
