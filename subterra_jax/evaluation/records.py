@@ -135,10 +135,10 @@ def summarise(records: Records, seed: int = 0) -> dict[str, Any]:
         seed: Seed of the bootstrap.
 
     Returns:
-        `episodes`; `success`, the mean; `success_iqm`, the inter-quartile mean over the groups of episodes; the ends
-        `success_low` and `success_high` of the 95 % interval of the mean; `contacts_per_100m` over all episodes
-        together; means of the rest of the record's quantities (of `goal_error` and `axial_final` the mean size), and of
-        `nees` the median too; with several severities `success_by_severity` and `success_area` under it.
+        `episodes`; `success`, the mean; the ends `success_low` and `success_high` of the 95 % interval of the mean;
+        `contacts_per_100m` over all episodes together; means of the rest of the record's quantities (of `goal_error`
+        and `axial_final` the mean size), and of `nees` the median too; with several severities `success_by_severity`
+        and `success_area` under it.
     """
     groups = grouped(records.success.astype(float), records.group)
     low, high = interval(groups, lambda scores: scores.mean(axis=(-2, -1)), seed)
@@ -146,7 +146,6 @@ def summarise(records: Records, seed: int = 0) -> dict[str, Any]:
     found: dict[str, Any] = {
         "episodes": len(records),
         "success": float(records.success.mean()),
-        "success_iqm": interquartile_mean(groups.mean(axis=1)),
         "success_low": low,
         "success_high": high,
         "contacts_per_100m": float(100.0 * records.contact.sum() / travelled) if travelled > 0.0 else None,
@@ -174,17 +173,6 @@ def grouped(values: Float[np.ndarray, " n"], group: Int[np.ndarray, " n"]) -> Fl
     return np.stack([row[:size] for row in rows])
 
 
-def interquartile_mean(scores: Float[np.ndarray, " n"]) -> float:
-    """Compute the mean of the middle half, the values on its borders counted in part.
-
-    Source: Agarwal et al. 2021, Deep Reinforcement Learning at the Edge of the Statistical Precipice.
-    """
-    n = len(scores)
-    # Value i covers the quantiles from i / n to (i + 1) / n.
-    ends = np.clip(np.arange(n + 1) / n, 0.25, 0.75)
-    return float(np.sum(np.sort(scores) * np.diff(ends)) / 0.5)
-
-
 def interval(
     scores: Float[np.ndarray, "strata size"],
     statistic: Callable[[np.ndarray], np.ndarray],
@@ -199,7 +187,7 @@ def interval(
         seed: Seed of the draws: the same scores give the same interval.
         level: Confidence.
 
-    Source: Agarwal et al. 2021, as `interquartile_mean`.
+    Source: Agarwal et al. 2021, Deep Reinforcement Learning at the Edge of the Statistical Precipice.
     """
     strata, size = scores.shape
     index = np.random.default_rng(seed).integers(size, size=(N_RESAMPLES, strata, size))

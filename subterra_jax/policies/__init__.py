@@ -13,7 +13,6 @@ from subterra_jax.policies.loading import (
     check_task,
     from_tensors,
     load,
-    register_released,
     training_conditions,
     with_map,
 )
@@ -33,7 +32,6 @@ __all__ = [
     "load_policy",
     "name_for",
     "open_agent",
-    "register_released",
     "released",
     "training_conditions",
     "with_map",

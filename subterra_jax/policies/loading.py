@@ -1,6 +1,5 @@
 """From tensors and facts to an agent, and whether it fits a task."""
 
-import functools
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -8,9 +7,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from subterra_jax.baselines import registry
 from subterra_jax.compiled import in_32_bits
-from subterra_jax.policies.files import GAIT, TRAINED_UNDER, Conditions, PolicyError, PolicyFile, read, released
+from subterra_jax.policies.files import GAIT, TRAINED_UNDER, Conditions, PolicyError, PolicyFile, read
 from subterra_jax.policies.learnt import Learnt
 from subterra_jax.policies.locate.agent import Locating
 from subterra_jax.policies.trained import Trained
@@ -130,30 +128,6 @@ def _check_period(trained: float, here: float, source: str | Path, task: str) ->
 def _period(params: Any) -> float:
     """Returns the control period of a task, s."""
     return round(float(np.max(np.asarray(params.vehicle.period))), 6)
-
-
-def register_released() -> tuple[str, ...]:
-    """Adds every released policy that drives to the baselines, as `policy:NAME`; those there already stay.
-
-    Returns:
-        Their names.
-    """
-    names = tuple(PREFIX + name for name in released() if not name.startswith("B2"))
-    for name in names:
-        if name not in registry.names():
-            registry.register(name, functools.partial(_make_released, name.removeprefix(PREFIX)))
-    return names
-
-
-def _make_released(name: str, params: EnvParams) -> Trained:
-    """Makes the agent of a released policy for a task.
-
-    Raises:
-        PolicyError: It was trained with another control period.
-    """
-    agent, _ = load(name)
-    _check_period(agent.conditions.period, _period(params), name, "this task")
-    return with_map(agent, params)
 
 
 def _checked(file: PolicyFile) -> Trained:

@@ -20,7 +20,6 @@ from subterra_jax.evaluation.records import (
     add_estimate,
     area,
     crps,
-    interquartile_mean,
     interval,
     start_estimates,
     summarise,
@@ -164,13 +163,6 @@ def tallied(errors, tolerance=1.0):
 def test_time_to_lock_is_the_last_time_the_estimate_was_beyond_the_tolerance():
     assert tallied([0.5, 2.0, 0.5, 0.5]).unlocked == 2
     assert tallied([0.5, 0.5]).unlocked == 0
-
-
-def test_the_interquartile_mean_is_the_mean_of_the_middle_half():
-    assert interquartile_mean(np.array([100.0, 1.0, 2.0, -50.0])) == 1.5
-    assert interquartile_mean(np.arange(1.0, 9.0)) == 4.5
-    # Of five values the second and fourth count three quarters each.
-    np.testing.assert_allclose(interquartile_mean(np.array([0.0, 1.0, 2.0, 4.0, 9.0])), (0.75 + 2.0 + 3.0) / 2.5)
 
 
 def test_the_bootstrap_interval_of_a_mean_is_that_of_the_normal_law():
