@@ -336,7 +336,7 @@ def judge_case(case: Case, config: JudgeConfig) -> dict[str, Any]:
     """Builds a case by the command line, as a user would, and returns its row of results."""
     scene, log = config.out / "scenes" / case.name, config.out / "logs" / f"{case.name}.txt"
     truth, started = load_truth(case.truth), time.monotonic()
-    ran = run_module("scene.build", case.source, "--out", scene, "--fresh", *config.flags.split(), log=log)
+    ran = run_module("scene.build", case.source, "--out", scene, *config.flags.split(), log=log)
     row: dict[str, Any] = {"name": case.name, "seconds": time.monotonic() - started, **ran._asdict(), "warnings": []}
     faults = []
     if ran.status == 0:

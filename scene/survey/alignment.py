@@ -112,30 +112,6 @@ def draw_railway(rng: np.random.Generator, length: float) -> Elements:
     return Elements(np.array(knots), np.array(curvature), profile, grade)
 
 
-def draw_s_bend(rng: np.random.Generator, length: float) -> Elements:
-    """Draws arcs of 60 m radius to either side in turn, with clothoids between, and grades within ±1 %.
-
-    The arcs take a fifth of the length each, but no more than 40 m, which turns by 38°.
-    """
-    run = float(np.clip(0.2 * length, 2.0, 40.0))
-    clothoid = 0.5 * run
-    knots, curvature = [-MARGIN, 0.25 * clothoid], [0.0, 0.0]
-    bend = rng.choice([-1.0, 1.0]) / 60.0
-    while knots[-1] < length + MARGIN:
-        for step, value in ((clothoid, bend), (run, bend), (clothoid, 0.0)):
-            knots.append(knots[-1] + step)
-            curvature.append(value)
-        bend = -bend
-    railway = draw_railway(rng, length)
-    return Elements(np.array(knots), np.array(curvature), railway.profile, railway.grade)
-
-
-def draw_grade(rng: np.random.Generator, length: float) -> Elements:
-    """Draws a railway in plan that climbs at 3 % throughout."""
-    railway = draw_railway(rng, length)
-    return Elements(railway.plan, railway.curvature, railway.profile, np.full_like(railway.grade, 0.03))
-
-
 # Source: the ring centres of a real metro shield tunnel, `export_best_fit_result.csv` of
 # github.com/suben-mk/As-built-Tunnel-Segment-Center-Rev.05 (© 2021 Suben Mukem, MIT), 65 rings on 448 m. Derived by
 # least squares: curvature and grade, linear between knots 30 m apart, integrated to plan positions and heights, fitted

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from scene.survey.alignment import Alignment, Elements, draw_grade, draw_railway, draw_s_bend, lay_out, metro_elements
+from scene.survey.alignment import Alignment, Elements, draw_railway, lay_out, metro_elements
 from scene.survey.config import TruthName
 from scene.survey.furniture import DESIGN, SLEEPER_RISE, Furniture, Sizes, draw_furniture, draw_sizes
 from scene.survey.mesh import Mesh, Part, join_meshes, nail_mesh, surface_mesh, track_mesh
@@ -20,7 +20,6 @@ from scene.survey.section import (
     circle,
     d_shape,
     draw_field,
-    ellipse,
     horseshoe,
     rectangle,
     vault,
@@ -165,12 +164,6 @@ class Bore:
         return replace(mesh, vertices=np.round(mesh.vertices, 6))
 
 
-def _wider_middle(length: float) -> Trend:
-    """1 m wider over the middle third, with ramps of an eighth of the length, at most 8 m."""
-    ramp, third = min(8.0, length / 8.0), length / 3.0
-    return Trend((third - 0.5 * ramp, third + 0.5 * ramp, 2 * third - 0.5 * ramp, 2 * third + 0.5 * ramp), (0, 1, 1, 0))
-
-
 def _flare(length: float, run: float, width: float) -> Trend:
     """Return a last mouth that is wider, opening with the square of the distance over a run, m."""
     share = np.linspace(0.0, 1.0, int(run) + 1)
@@ -251,11 +244,7 @@ class _Class:
 _CLASSES: dict[TruthName, _Class] = {
     "paper": _Class("D"),
     "metro": _Class("D", elements=metro_elements, sizes=_PAPER_SLEEPERS),
-    "ellipse": _Class("ellipse", ellipse),
-    "widening": _Class("D, widening", widening=_wider_middle),
     "horseshoe": _Class("horseshoe", horseshoe),
-    "s-bend": _Class("D", elements=draw_s_bend),
-    "grade": _Class("D", elements=draw_grade),
     "irregular": _Class("irregular", arch, widening=lambda length: _flare(length, 6.0, 3.0), rough=True),
     "circle": _Class("circle", circle),
     "portal": _Class(

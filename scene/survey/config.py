@@ -11,7 +11,7 @@ from scene.survey.conventions import Convention
 
 LidarName = Literal["avia", "vlp16", "os1"]
 TruthName = Literal[
-    "paper", "metro", "ellipse", "widening", "horseshoe", "s-bend", "grade", "irregular", "circle",
+    "paper", "metro", "horseshoe", "irregular", "circle",
     "portal", "corridor", "works", "platform", "road", "slabtrack",
 ]  # fmt: skip
 METRO_LENGTH = 351.0  # m of the real alignment that are at hand

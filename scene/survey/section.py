@@ -153,13 +153,6 @@ def arch() -> Shape:
     return _sample_half(Shape, _d_half())
 
 
-def ellipse() -> Shape:
-    """Return an upright ellipse with half-axes of 2.8 and 3.3 m, filled flat 0.6 m above its lowest point."""
-    begin = np.arcsin(0.6 / 3.3 - 1.0)
-    angle = np.linspace(begin, 0.5 * np.pi, 8001)
-    return _sample_half(Shape, np.stack([2.8 * np.cos(angle), 2.7 + 3.3 * np.sin(angle)], axis=-1))
-
-
 def horseshoe() -> Shape:
     """Return a semicircular crown of 2.9 m on walls that draw in, along arcs of 6 m, to 4.19 m at the floor."""
     wall = _arc((2.9 - 6.0, 3.0), 6.0, -np.arcsin(3.0 / 6.0), 0.0)

@@ -148,7 +148,7 @@ def test_cases_are_found_built_once_and_judged(tmp_path: Path, truth: Truth, mon
     for _ in range(2):
         words = [str(folder), "--out", str(out), "--only", "arch", "room", "--flags=--fast yes"]
         assert dirty.main(words) == 0
-    assert built == [("scene.build", "--fresh", "--fast", "yes")] * 2, "what is there was built again"
+    assert built == [("scene.build", "--fast", "yes")] * 2, "what is there was built again"
     rows = {row["name"]: row for row in json.loads((out / "dirty.json").read_text())["rows"]}
     assert {name: row["verdict"] for name, row in rows.items()} == {"arch": "right", "room": "refused"}
     assert "| arch | right | 0.00 | 100.00 |" in (out / "dirty.md").read_text()

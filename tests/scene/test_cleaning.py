@@ -224,7 +224,7 @@ def test_a_widening_of_a_lay_bys_length_is_bore_and_a_niche_is_not(length, out, 
 def test_a_mouth_at_which_no_direction_shows_the_wall_ends_where_its_last_row_does():
     grid = Grid.over(0.0, 40.0, 0.5, 120)
     wall, every = np.full((grid.rows, 120), 2.75), np.ones((grid.rows, 120), bool)
-    tube = WallTube(grid, wall, wall, every, every, every)
+    tube = WallTube(grid, wall, wall, every, every, every, ~every, np.empty((0, 3)))
     rng = np.random.default_rng(8)
     station, turn = rng.uniform(0.0, 40.0, 50_000), rng.uniform(-np.pi, np.pi, 50_000)
     radius = np.where(station > 30.0, 4.0, 2.75)  # a flare: closed all around, but nowhere near the wall

@@ -13,7 +13,6 @@ from tests.scene.corridors import FURNITURE, HEIGHT, WIDTH, Thing, corridor, fur
 from tests.scene.fits import thin
 
 QUICK = ("racks", "shelves", "machines", "closets")
-SHOWN_ABOVE = {"lockers": 2.0}  # m: without a gap between them, nobody saw the wall further down
 
 
 def built(things: list[Thing], recesses: tuple[Thing, ...] = ()) -> tuple[Bore, Cleaned, np.ndarray, bool]:
@@ -39,7 +38,7 @@ def test_walls_are_where_they_are_whatever_stands_along_one(kind):
     bore, cleaned, surface, refused = built(things)
     assert not refused
     assert bore.length == pytest.approx(20.0, abs=0.2)
-    left, right = off_wall(surface, 1), off_wall(surface, -1, low=SHOWN_ABOVE.get(kind, 0.3))
+    left, right = off_wall(surface, 1), off_wall(surface, -1)
     assert np.percentile(np.abs(left), 99) < 0.05
     assert np.percentile(np.abs(right), 90) < 0.05
     assert np.median(np.abs(right)) < 0.02
@@ -51,6 +50,14 @@ def test_doors_set_back_from_a_wall_do_not_move_it():
     _, cleaned, surface, refused = built([], doors)
     assert not refused
     assert np.abs(np.median(off_wall(surface, -1, low=2.2))) < 0.02
+    assert not (cleaned.cause == Cause.STANDING).any()
+
+
+def test_a_void_above_the_walls_does_not_move_them():
+    void = ((0.0, 20.0), (-WIDTH / 2 - 0.6, -WIDTH / 2), (1.9, HEIGHT + 0.1))
+    _, cleaned, surface, _ = built([], (void,))
+    low = (surface[..., 1] < 0) & (surface[..., 2] > 0.3) & (surface[..., 2] < 1.6)
+    assert np.abs(np.median(surface[low][:, 1] + WIDTH / 2)) < 0.02
     assert not (cleaned.cause == Cause.STANDING).any()
 
 

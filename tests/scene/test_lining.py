@@ -12,7 +12,7 @@ from tests.scene.fits import Line, fitted, thin
 from tests.scene.shapes import midline, swept
 from tests.scene.test_irregular_walls import Irregular
 
-RADIUS, LENGTH, RING = 2.75, 18.0, 1.5
+RADIUS, LENGTH, RING = 2.75, 12.0, 1.5
 LINE = (np.full(3, 40.0), np.array([40.0 + LENGTH, 40.0, 40.0]))
 JOINTS = np.arange(0.75, LENGTH, RING)
 ROWS = np.deg2rad([-30.0, 10.0, 50.0, 90.0, 130.0, 170.0, 210.0])
@@ -22,7 +22,7 @@ OFFSET, HALF, DEPTH, NAIL = 0.22, (0.10, 0.09), 0.13, 0.06
 def lined(nails: bool) -> np.ndarray:
     """A round bore with recesses of known size, each pair bridged by a bolt of 28 mm, seen from everywhere."""
     rng = np.random.default_rng(1)
-    station, angle = rng.random(700_000) * LENGTH, rng.uniform(-np.pi, np.pi, 700_000)
+    station, angle = rng.random(470_000) * LENGTH, rng.uniform(-np.pi, np.pi, 470_000)
     radius = np.full(len(station), RADIUS)
     hole, bolt = np.zeros(len(station), bool), np.zeros(len(station), bool)
     for joint in JOINTS:
