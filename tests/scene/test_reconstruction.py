@@ -25,7 +25,7 @@ def offsets(bore: Bore, cloud: Cloud, known: KnownBore) -> tuple[np.ndarray, np.
 
 @pytest.mark.parametrize("yaw", [0.0, 2.3, -1.6])
 def test_a_curved_d_bore_is_measured_in_any_orientation(yaw):
-    known = curved_d_bore(length=24.0, yaw=yaw, per_metre=2000)
+    known = curved_d_bore(yaw=yaw, per_metre=2000)
     bore, cloud = rebuilt(known.points)
     lateral, vertical = offsets(bore, cloud, known)
     assert np.sqrt(np.mean(lateral**2)) < 0.01
