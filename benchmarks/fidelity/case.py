@@ -60,6 +60,7 @@ class Case:
             for key in [key for key in results if _KEPT_UNTIL.get(key[:2]) in done]:
                 del results[key]
         meshes = [value for value in self.cache.values() if isinstance(value, trimesh.Trimesh)]
+        meshes += [] if self.truth is None else [self.truth.surface]
         for mesh in (*meshes, self.candidate.lining, self.candidate.solid):
             mesh._cache.clear()
 
