@@ -132,9 +132,9 @@ def open_values(case: Case, folder: Path, processes: int = 1) -> Iterator[dict[s
         keep(tuple(names))
 
 
-# The first process puts the stated faults in as well, which takes it as long as the categories that it does not have;
-# it alone has the recording that the builder read.
-FIRST_HALF = ("CEN", "SEC", "C2M", "CMP", "BEA", "SCN", "PAR")
+# Halves of about the same time, with the stated faults that the first process puts in as well: what beams derive serves
+# the first, what the bore derives the second. The first alone has the recording that the builder read.
+FIRST_HALF = ("CEN", "SEC", "C2M", "CMP", "BEA", "DIS", "SCN", "PAR", "DEG")
 SECOND_HALF = tuple(name for name in table.CATEGORIES if name not in FIRST_HALF)
 
 
