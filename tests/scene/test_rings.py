@@ -32,6 +32,8 @@ def test_circles_are_recovered(tmp_path):
     bore = bore_from_rings(fit, np.array([1000.0, 500, 10]))
     assert bore.length == pytest.approx(16.5, abs=1e-3)
     np.testing.assert_allclose(bore.ring_station, 1.5 * np.arange(12), atol=1e-3)
+    assert not bore.filled[::6].any()  # stations of rings, 0.25 m apart from the next
+    assert bore.filled[3::6].all()
 
 
 def test_one_gross_outlier_does_not_move_a_ring(tmp_path):

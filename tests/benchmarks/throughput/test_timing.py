@@ -27,6 +27,12 @@ def test_every_observation_is_in_the_checksum():
     assert len(speed.steps_per_second) == 2
 
 
+def test_a_rate_counts_the_steps_of_every_environment():
+    program = prepare(counting(), 3, Timing(steps=4))
+    elapsed = program.call(jax.random.key(0))
+    assert program.speed().steps_per_second == [pytest.approx(3 * 4 / elapsed)]
+
+
 def test_calls_get_fewer_steps_where_they_would_take_too_long():
     assert prepare(counting(), 3, Timing(steps=50, repeats=20, seconds=1e-9)).steps == 1
     assert prepare(counting(), 3, Timing(steps=50, repeats=20, seconds=1e9)).steps == 50
