@@ -57,6 +57,7 @@ KNOWN = (
     (PLAIN, {"depth": 0.20}, {"lin_pocket_depth_mae": about(0.07, 5e-3), "lin_pocket_f1": about(1.0)}),
     (PLAIN, {"rings": 1.2}, {
         "lin_ring_phase_err": about(1 / 3, 0.02), "lin_axial_pitch_err": below(0.5), "lin_pocket_f1": below(0.6)}),
+    (PLAIN, {"rings": 0.92}, {"lin_pocket_f1": below(0.2)}),  # 22 cm from a pocket on either side
     (PLAIN, {"pitch": 1.6}, {"lin_axial_pitch_err": about(100 * 0.1 / 1.5, 1.0)}),
     (PLAIN, HEARD, {
         "sec_width_bias": below(0.03), "sec_height_bias": below(0.03), "lin_pocket_f1": above(0.6),
