@@ -23,9 +23,7 @@ _NAMES = {
     "walls-sprayed": "sprayed", "beams-06": "6 beams", "beams-32": "32 beams", "beams-64": "64 beams",
     "dust-half": "thin dust", "dust-lock": "own cloud", "motion-walk": "walked", "motion-b2": "B2",
 }  # fmt: skip
-_OURS = {  # colour and marker of what is not a SLAM program
-    "wheel-odometry": ("0.3", "s"), "particle-filter": ("0.5", "D"),
-}  # fmt: skip
+_OURS = {"wheel-odometry": ("0.3", "s")}  # colour and marker of what is not a SLAM program
 _ASIDE = 0.05  # of the distance between two recordings, from one program to the next
 _LEAST = 3e-5  # m per 100 m, lower end of the figure
 

@@ -13,7 +13,7 @@ from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
 from benchmarks.slam.__main__ import command
-from benchmarks.slam.arena import bags, describe, record, sets
+from benchmarks.slam.arena import bags, record, sets
 from benchmarks.slam.arena.drives import CARRIERS, REST, measure_wheels
 from benchmarks.slam.arena.walls import draw_walls
 from benchmarks.slam.reading import read_samples, sweep_points
@@ -285,7 +285,7 @@ def test_a_set_describes_its_files_and_courses(tmp_path):
         (folder / "calibration.yaml").write_text(json.dumps(record.calibration(scene)))
     (tmp_path / "truth").mkdir()
     (tmp_path / "truth" / "lidar.tum").write_text("secret")
-    describe.describe_set(tmp_path, plan)
+    sets.describe_set(tmp_path, plan)
     content = json.loads((tmp_path / "croissant.json").read_text())
     files = {one["contentUrl"]: one["sha256"] for one in content["distribution"]}
     told = {str(path.relative_to(tmp_path)) for path in (tmp_path / "recordings").rglob("*") if path.is_file()}
