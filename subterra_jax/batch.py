@@ -82,15 +82,15 @@ class AutoReset:
         noise = self.env.draw_step(step_key, (n_envs,), params)
         stepped, reward, terminated, truncated, info = self._vmap(self.env.advance, 3)(state, action, noise, params)
         # A consumer's sum would draw the whole step into its kernel, which sums with few threads; also below.
-        reward, terminated, truncated = jax.lax.optimization_barrier((reward, terminated, truncated))
+        terminated, truncated = jax.lax.optimization_barrier((terminated, truncated))
         begun = self._vmap(self.env.begin, 1)(self.env.draw_reset(start_key, (n_envs,), params), params)
         done = terminated | truncated
         merged = jax.tree.map(
             lambda new, old: jnp.where(done.reshape(-1, *[1] * (old.ndim - 1)), new, old), begun, stepped
         )
         obs, info["final_observation"] = self._observe(done, merged, stepped, noise, params)
-        obs, merged = jax.lax.optimization_barrier((obs, merged))
-        return obs, merged, reward, terminated, truncated, info
+        shown = jax.lax.optimization_barrier((obs, merged, reward, terminated, truncated))
+        return *shown, info
 
     def _checked(self, action: Any, state: State) -> Array:
         action, n_envs = jnp.asarray(action), jax.tree.leaves(state)[0].shape[0]

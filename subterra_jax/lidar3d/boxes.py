@@ -9,7 +9,8 @@ from jaxtyping import Float
 
 from subterra_jax.lidar3d.surface import BOX_CORNERS, BOX_FACES, Triangles
 
-_SQUARE = 2e-5  # m, and share, by which a box may be askew: a tunnel's file has whole units
+_OFF = 2e-5  # m, by which a corner may be off its box: a tunnel's file has whole units
+_FLAT = 1e-3  # least volume of a box, as a share of what its edges would have if they were square to one another
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,8 +33,8 @@ class Boxes:
         return Boxes((self.centre - centre) @ turn.T, self.half @ turn.T)
 
     def rows(self) -> Float[np.ndarray, "k 12"]:
-        """Return the boxes as `Cells.box` has them."""
-        rows = self.half / np.sum(self.half**2, axis=-1, keepdims=True)
+        """Return the boxes as `Cells.box` has them, exact for edges that are not quite square to one another."""
+        rows = np.linalg.inv(self.half).swapaxes(1, 2)
         return np.concatenate([rows, np.einsum("kij,kj->ki", rows, self.centre)[..., None]], axis=-1).reshape(-1, 12)
 
 
@@ -56,10 +57,9 @@ def split_boxes(surface: Triangles) -> tuple[Triangles, Boxes]:
     start = start[np.all(run == BOX_FACES, axis=(1, 2))]
     corner = vertices[faces[start, 0][:, None] + np.arange(len(BOX_CORNERS))]
     found = Boxes(corner.mean(axis=1), np.einsum("ci,kcj->kij", BOX_CORNERS, corner) / len(BOX_CORNERS))
-    size = np.sum(found.half**2, axis=-1)
-    leaning = [np.abs(np.sum(found.half[:, i] * found.half[:, (i + 1) % 3], axis=-1)) for i in range(3)]
-    true = np.abs(found.corners() - corner).max(axis=(1, 2), initial=0.0) < _SQUARE
-    true &= (size.min(axis=1, initial=np.inf) > 0.0) & (np.max(leaning, axis=0) < _SQUARE * size.max(axis=1))
+    square = np.prod(np.linalg.norm(found.half, axis=-1), axis=-1)
+    true = np.abs(found.corners() - corner).max(axis=(1, 2), initial=0.0) < _OFF
+    true &= (square > 0.0) & (np.abs(np.linalg.det(found.half)) > _FLAT * square)
     kept = np.ones(len(faces), bool)
     kept[(start[true][:, None] + np.arange(n)).ravel()] = False
     return Triangles(vertices, faces[kept]), found.pick(true)

@@ -113,6 +113,20 @@ def test_a_box_and_a_thin_post_stand_in_the_way(reliefs):
     assert (cast(reliefs["tube"], origins, ahead)[:, 0] == 30.0).all()
 
 
+def test_a_rail_whose_edges_are_not_square_is_met_where_its_faces_are():
+    axis, rng = surfaces.axis_of(LENGTH), np.random.default_rng(4)
+    rail = BOX_CORNERS * [4.0, 0.035, 0.07]
+    rail = rail + [30.0, 0.7, -1.2] + rail[:, :1] * [0.0, 3e-3, 1e-3] + rail[:, 1:2] * [0.05, 0.0, 0.0]
+    surface = surfaces.together(surfaces.tube(axis, RADIUS, 60, 31), (rail, BOX_FACES))
+    origin = np.float32([[24.0, 0.3, -0.5], [33.0, 1.0, -0.9]])
+    end = rail.mean(axis=0) + rng.uniform(-1.0, 1.0, (2, N_BEAMS, 3)) * [4.0, 0.03, 0.06]
+    way = end - origin[:, None]
+    way = (way / np.linalg.norm(way, axis=-1, keepdims=True)).astype(np.float32)
+    ranges = cast(relief_of(axis, surface), origin, way)
+    truth = surfaces.brute(surface, np.repeat(origin, N_BEAMS, axis=0), way.reshape(-1, 3))
+    np.testing.assert_allclose(ranges.ravel(), truth, atol=2e-4)
+
+
 def test_a_rough_bend_with_recesses_agrees_with_brute_force_over_every_triangle(bend, reliefs):
     axis, surface = bend
     rng = np.random.default_rng(2)
