@@ -135,15 +135,29 @@ def _fitting(driver: Driver, given: Policy, config: TrainConfig) -> Policy:
     found = flat(given.network)
     for name, leaf in wanted.items():
         tensor = found.get(name)
-        # One number more in the inputs, the localiser's doubt, is what `along` adds to a policy without memory; earlier
-        # observations come before the newest.
-        doubt = 0 if tensor is None else leaf.shape[0] // config.frames - tensor.shape[0]
-        if tensor is not None and tensor.shape != leaf.shape and doubt in (0, 1) and tensor.shape[1:] == leaf.shape[1:]:
-            earlier = leaf.shape[0] - leaf.shape[0] // config.frames
-            found[name] = np.pad(tensor, [(earlier, doubt), *[(0, 0)] * (tensor.ndim - 1)])
-        elif tensor is None or tensor.shape != leaf.shape:
+        wider = None if tensor is None else _widened(tensor, leaf.shape, config.frames)
+        if wider is None:
             has = "no such weights" if tensor is None else f"{tuple(tensor.shape)}"
             raise ConfigError(
                 f"begin_from = {source} has another network: {name} is {tuple(leaf.shape)} here and has {has} there"
             )
+        found[name] = wider
     return dataclasses.replace(given, network=nested({name: found[name] for name in wanted}))
+
+
+def _widened(tensor: np.ndarray, shape: tuple[int, ...], frames: int) -> np.ndarray | None:
+    """Returns weights for more inputs, 0 for those that are new; None where they do not fit.
+
+    One number more in each observation, the localiser's doubt, is what `along` adds to a policy that has none; earlier
+    observations come before the newest.
+    """
+    if tensor.shape == shape:
+        return tensor
+    if tensor.shape[1:] != shape[1:]:
+        return None
+    for known in (frames, 1):
+        doubt = shape[0] // frames - tensor.shape[0] // known
+        if tensor.shape[0] % known == 0 and doubt in (0, 1):
+            rows = tensor.reshape(known, -1, *tensor.shape[1:])
+            return np.pad(rows, [(frames - known, 0), (0, doubt), *[(0, 0)] * (tensor.ndim - 1)]).reshape(shape)
+    return None

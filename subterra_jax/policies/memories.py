@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from subterra_jax.baselines.agent import Observed
 from subterra_jax.baselines.histogram import HistogramLocaliser
-from subterra_jax.baselines.stations import Driven, Station, believed_start, told_start
+from subterra_jax.baselines.stations import Driven, Station, believed_start, odometry_sigma, told_start
 from subterra_jax.baselines.steering import CentreLine, Corridor
 from subterra_jax.policies import inputs
 from subterra_jax.policies.inputs import Reckoned
@@ -23,6 +23,7 @@ from subterra_jax.policies.locate.map_strip import MapStrip
 from subterra_jax.policies.locate.ways import TwoWays
 from subterra_jax.state import EnvParams
 
+_SURE = 3.0  # standard deviations of the odometer
 MEMORIES = ("none", "stack", "gru", "along", "map")
 
 
@@ -62,7 +63,7 @@ class Memory:
     @property
     def relief(self) -> bool:
         """True where the inputs show the relief of the walls: who forgets it has no use for it."""
-        return self.kind in ("stack", "gru")
+        return self.kind == "gru" or self.frames > 1
 
     def begin(self, obs: Observed, params: EnvParams, given: "Given") -> Kept:
         """Returns what is kept before the first `take`, which gets the same observation and a command of 0."""
@@ -126,7 +127,10 @@ class Memory:
         way = inputs.way_to_go(reckoned, obs, params)
         log_sigma = jnp.zeros(())
         if located is not None and params.errand == "report":
-            way, log_sigma = params.goal.travel_max - (obs.distance - reckoned.distance), located.station.log_sigma
+            # As far as it surely may: who drives on for longer than allowed has failed.
+            doubt = _SURE * odometry_sigma(params.goal.travel_max, jnp.zeros(()), params)
+            way = params.goal.travel_max - doubt - (obs.distance - reckoned.distance)
+            log_sigma = located.station.log_sigma
         elif located is not None:
             station, log_sigma = located.station.station, located.station.log_sigma
             way = obs.goal - station
