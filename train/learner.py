@@ -86,14 +86,14 @@ class Learner(devices.Whole):
     ) -> None:
         self.config, self.split = config, split
         self.env, self.driver = env, driver
-        self._given = Policy(None) if given is None else given
+        self.given = Policy(None) if given is None else given
         self._localiser = localiser
         self._adam = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(eps=1e-5))
 
     def init(self, key: PRNGKeyArray, params: Any) -> TrainState:
         """Makes an untrained network, and starts an episode in every environment."""
         key_weights, key_reset, key_rest, key_localiser = jax.random.split(key, 4)
-        given = self._given
+        given = self.given
         weights = self.driver.init(key_weights) if given.network is None else _arrays(given.network)
         localiser = _arrays(given.localiser)
         if self._localiser is not None:
