@@ -92,7 +92,6 @@ MISTAKES = {
     "benchmarks.fidelity run --scene tunnel --out text.txt": "text.txt: is a file",
     "benchmarks.fidelity controls --scene tunnel --only N999 --out o": "no control 'N999'",
     "benchmarks.fidelity controls --scene tunnel --processes 0 --out o": "processes must be at least 1",
-    "benchmarks.fidelity sweep --scene tunnel --tolerances nan --out o": "tolerances must be positive, got nan",
     "benchmarks.fidelity windows --scene none --out o": "none: no such file or folder",
     "benchmarks.fidelity faults --scene tunnel --draw -1 --out o": "draw must not be negative",
     "benchmarks.fidelity faults --scene tunnel --kinds ghost --out o": "no size of 'ghost' is asked for",
@@ -150,7 +149,7 @@ MISTAKES = {
 }
 COMMANDS = sorted({words.split()[0] for words in MISTAKES} - {"benchmarks.fidelity", "benchmarks.slam"}) + [
     f"benchmarks.fidelity{part}"
-    for part in ("", " run", " controls", " sweep", " split", " report", " windows", " faults")
+    for part in ("", " run", " controls", " sweep", " split", " windows", " faults")
 ] + [f"benchmarks.slam{part}" for part in ("", " arena", " board", " check", " score")]  # fmt: skip
 
 

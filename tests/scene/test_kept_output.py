@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 
 from scene.inputs import library_versions
-from subterra_jax.host import files
 from subterra_jax.host.errors import OutputError
 from subterra_jax.host.files import replace_folder
 
@@ -22,10 +21,7 @@ def test_libraries_that_are_not_installed_have_no_version():
     assert list(library_versions(("numpy", "no-such-library"))) == ["numpy"]
 
 
-@pytest.mark.parametrize("exchange", [True, False])
-def test_a_folder_is_replaced_and_a_half_done_replacement_is_put_right(tmp_path, exchange, monkeypatch):
-    if not exchange:
-        monkeypatch.setattr(files, "_exchange", lambda one, other: False)
+def test_a_folder_is_replaced_and_a_half_done_replacement_is_put_right(tmp_path):
     out = tmp_path / "out"
     for text in ("old", "new"):
         with replace_folder(out) as folder:

@@ -157,11 +157,11 @@ def test_a_batch_gives_what_one_scan_after_another_gives(reliefs):
 def test_reliefs_of_the_same_sizes_share_one_program(reliefs):
     way = np.tile(beams.planar(N_BEAMS), (1, 1, 1))
     cast(reliefs["tube"], [30.0, 0.0, 0.0], way)
-    before = len(TRACES)
+    before, programs = len(TRACES), device_cast._cache_size()
     for name, x in (("things", 12.0), ("bend", 7.0), ("tube", 31.0)):
         cast(reliefs[name], [x, 0.1, 0.1], way, range_max=20.0)
     assert len(TRACES) == before
-    assert device_cast._cache_size() == 1
+    assert device_cast._cache_size() == programs
 
 
 def test_a_pose_that_is_no_number_ends_and_gives_no_number(reliefs):

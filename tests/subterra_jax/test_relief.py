@@ -64,10 +64,12 @@ def test_boxes_are_told_from_other_triangles():
     box = surface.Triangles(surface.BOX_CORNERS * [0.2, 0.3, 0.4] + [1.0, 2.0, 3.0], surface.BOX_FACES)
     leaning = surface.Triangles(box.vertices + 0.5 * box.vertices[:, [1, 2, 0]], surface.BOX_FACES)
     tube = surface.Triangles(*surfaces.tube(surfaces.axis_of(10.0), 2.0, 8, 5))
-    rest, boxes = split_boxes(surface.join_surfaces([tube, box, leaning, box, tube]))
+    bent = surface.Triangles(box.vertices + 0.01 * (np.arange(8) == 3)[:, None], surface.BOX_FACES)
+    rest, boxes = split_boxes(surface.join_surfaces([tube, box, leaning, bent, tube]))
     assert len(rest.faces) == 2 * len(tube.faces) + 12
-    np.testing.assert_allclose(boxes.centre, [[1.0, 2.0, 3.0]] * 2)
-    np.testing.assert_allclose(np.sort(np.abs(boxes.half).max(axis=1), axis=1), [[0.2, 0.3, 0.4]] * 2)
+    np.testing.assert_allclose(boxes.centre, [[1.0, 2.0, 3.0], [2.0, 3.5, 3.5]])
+    np.testing.assert_allclose(np.sort(np.abs(boxes.half[0]).max(axis=0)), [0.2, 0.3, 0.4])
+    np.testing.assert_allclose(boxes.corners()[1], leaning.vertices)
 
 
 def test_a_surface_too_fine_for_the_integers_gets_shorter_blocks_or_is_refused(monkeypatch):

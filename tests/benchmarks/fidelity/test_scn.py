@@ -98,4 +98,4 @@ def test_a_scene_without_a_robot_fails_the_step(rewritten):
 def test_what_does_not_change_is_not_computed_again(good, monkeypatch):
     before = measure("mj_wall_contact_err", good).value
     monkeypatch.setattr("benchmarks.fidelity.derive.contact.Probe", None)
-    assert measure("mj_wall_contact_err", Case(good.candidate)).value == before
+    assert measure("mj_wall_contact_err", good).value == before
