@@ -56,7 +56,7 @@ def test_gymnasium_finds_a_task_by_module_and_id_alone_and_nothing_heavy_comes_w
         f"env = gymnasium.make('subterra_jax:{TASK}', render_mode='rgb_array'); env.reset(); env.render();"
         f"print(type(env.unwrapped).__name__, [m for m in {heavy} if m in sys.modules])"
     )
-    folder = {"JAX_COMPILATION_CACHE_DIR": str(jax.config.jax_compilation_cache_dir)}
+    folder = {"JAX_COMPILATION_CACHE_DIR": kept} if (kept := jax.config.jax_compilation_cache_dir) else {}
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, env={**os.environ, **folder}
     )
