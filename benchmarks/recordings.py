@@ -95,7 +95,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Row:
-    """What came of a recording."""
+    """Outcome of a recording."""
 
     case: Case
     outcome: Outcome

@@ -1,4 +1,4 @@
-"""What a build was made of: name, size and hash of its inputs, and versions of the libraries that read them."""
+"""Inputs and libraries of a build: name, size and hash of its inputs, and versions of the libraries that read them."""
 
 import hashlib
 from collections.abc import Callable

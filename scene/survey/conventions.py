@@ -32,7 +32,7 @@ _PLUGINS = {"mcap": StoragePlugin.MCAP, "db3": StoragePlugin.SQLITE3}
 
 @dataclass(frozen=True)
 class Convention:
-    """How sweeps are published and stored."""
+    """Layout and container in which sweeps are published and stored."""
 
     # What the times of points count from: as the sensor's own `driver` has it; the `header`; the begin of the `sweep`,
     # whatever the header is of; 1970 (`epoch`); the `boot` of the sensor. One `constant` a sweep, or `none` at all.
