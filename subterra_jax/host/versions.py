@@ -1,6 +1,6 @@
 """This version, and messages about files of another."""
 
-VERSION = "0.1.0"  # as in pyproject.toml, which a checkout on the path does not tell
+VERSION = "1.0.0"  # as in pyproject.toml, which a checkout on the path does not tell
 
 BUILD_AGAIN = "build the scene again with `python -m scene.build`"
 _UPDATE = "pip install --upgrade subterra-jax"
