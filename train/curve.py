@@ -28,6 +28,7 @@ _COLUMNS = "episode,step,coverage_mean_100,success_mean_100"
 _EPISODE, _STEP, _SECOND = "finished episodes", "environment steps, millions", "seconds, with compiling"
 _AGAINST = {_EPISODE: ("episode", 1.0), _STEP: ("step", 1e6), _SECOND: ("second", 1.0)}
 _POINTS = 4000  # of one line in the figure
+_SMOOTH = 1000  # episodes that a success is averaged over in the figure: a hundred of them scatter by 4 %
 Curve = dict[str, np.ndarray]
 
 
@@ -73,8 +74,8 @@ def write_curve(runs: list[Path], png: Path, lines: Mapping[str, float] = Mappin
         _write_table(run, curve)
     figure, panels = pyplot.subplots(1, 2, figsize=(10.0, 4.0), sharey=True, layout="constrained")
     paper = [("coverage", _EPISODE), ("success", _EPISODE)]
-    wanted = paper if shown == "coverage" else [("success", _STEP), ("success", _SECOND)]
-    for axes, (name, against) in zip(panels, wanted, strict=True):
+    drawn = paper if shown == "coverage" else [("smooth", _STEP), ("smooth", _SECOND)]
+    for axes, (name, against) in zip(panels, drawn, strict=True):
         for (label, share), style in zip(lines.items(), cycle((":", "-.", "--"))):
             axes.axhline(100.0 * share, ls=style, lw=1.2, color="0.3", zorder=2, label=f"{label}, {100.0 * share:g} %")
         _draw(axes, [run.resolve().name for run in runs], curves, name, against)
@@ -97,6 +98,7 @@ def _curve(run: Path) -> Curve:
     """Returns episodes, steps, seconds, and the rolling means at each episode."""
     rows, log = read_episodes(run), read_log(run)
     means = {name: rolling(rows[name]) for name in ("coverage", "success")}
+    means["smooth"] = rolling(rows["success"], _SMOOTH)
     seconds = [line["timing"]["seconds"] for line in log]
     second = np.interp(rows["step"], [line["step"] for line in log], seconds) if log else rows["step"]
     return {"episode": rows["episode"], "step": rows["step"], "second": second, **means, "single": rows["coverage"]}
@@ -121,7 +123,8 @@ def _draw(axes: Any, names: list[str], curves: list[Curve], name: str, against: 
         _draw_band(axes, [curve[name] for curve in curves])
     if name == "coverage":
         axes.axhline(100.0 * GOAL, ls="--", lw=1.0, color="0.3", zorder=2, label=f"{100.0 * GOAL:.0f} % goal")
-    axes.set(xlabel=against, ylabel=f"{name}, %, mean of the last {WINDOW}", ylim=(0.0, 102.0))
+    label = f"success, %, mean of the last {_SMOOTH:,}" if name == "smooth" else f"{name}, %, mean of the last {WINDOW}"
+    axes.set(xlabel=against, ylabel=label, ylim=(0.0, 102.0))
     axes.set_xlim(left=0.0)
     axes.grid(alpha=0.3)
 
