@@ -167,13 +167,3 @@ def test_bad_input_is_one_sentence_status_2_and_no_output(case, inputs, tmp_path
     assert len(lines) == 1, told
     assert re.search(rf"^error: .*{sentence}", lines[0]), lines[0]
     assert not list(tmp_path.iterdir())
-
-
-def test_an_output_that_is_a_file_is_refused_before_any_work(bore_file, tmp_path, command):
-    blocked = tmp_path / "file"
-    blocked.write_text("mine")
-    for out in (blocked, blocked / "below"):
-        status, told = command(bore_file, "--out", out)
-        assert status == 2
-        assert f"{blocked}: is a file" in told
-    assert blocked.read_text() == "mine"

@@ -1,12 +1,10 @@
 """The parts of a simulated survey, one by one: pattern, errors, sizes within tolerance."""
 
 from dataclasses import fields, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from scene.survey.__main__ import main
 from scene.survey.alignment import draw_railway, lay_out
 from scene.survey.bore import draw_bore
 from scene.survey.carrier import IMUS
@@ -17,39 +15,6 @@ from scene.survey.lidar import AVIA_POINT_RATE, Lidar, avia, avia_directions, av
 from scene.survey.mesh import Mesh, Part
 from scene.survey.section import draw_field
 from scene.survey.write import describe_truth
-
-
-@pytest.mark.parametrize(
-    ("args", "reason"),
-    [
-        (["--length", "10"], "length must be more than 10 m"),
-        (["--length", "nan"], "length must be more than 10 m"),
-        (["--speed", "0"], "speed must lie between"),
-        (["--point-rate", "100"], "point_rate must be a multiple of 60"),
-        (["--seed", "-1"], "seed must not be negative"),
-        (["--truth", "metro", "--length", "352"], "length must be at most 351 m for truth metro"),
-        (["--truth", "irregular", "--correlation", "0.5"], "correlation must lie between 1 and 4 m"),
-        (["--scan-every", "0"], "scan_every must be at least 1"),
-        (["--sensors", "avia", "avia"], "sensors must differ"),
-        (["--cloud", "--sensors"], "cloud needs a sensor"),
-        (["--errors.lost", "1.5"], "errors.lost must lie between 0 and 1"),
-        (["--errors.range-noise", "nan"], "errors.range_noise must not be negative"),
-    ],
-)
-def test_a_wrong_value_is_refused_in_one_sentence(
-    args: list[str], reason: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["--out", str(tmp_path / "out"), *args]) == 2
-    told = capsys.readouterr().err
-    assert told.startswith(f"error: {reason}")
-    assert told.count("\n") == 1
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_file_in_place_of_the_folder_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "out").write_text("")
-    assert main(["--out", str(tmp_path / "out")]) == 2
-    assert "out must be a folder" in capsys.readouterr().err
 
 
 def rosette(begin: float, duration: float) -> np.ndarray:

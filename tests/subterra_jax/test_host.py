@@ -13,8 +13,6 @@ import tyro
 from gymnasium.envs import registration
 
 import subterra_jax as st
-from scene.build import command as build_command
-from scene.survey.config import SurveyConfig
 from subterra_jax.host import task_ids
 from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
 from subterra_jax.host.errors import OutputError, SubterraError
@@ -91,22 +89,6 @@ def test_a_mistake_is_one_sentence_and_status_2(capsys, words, sentence):
     assert told.startswith(f"error: {sentence}")
     assert told.endswith("; --help shows what there is\n")
     assert told.count("\n") == 1
-
-
-@pytest.mark.parametrize("command", [build_command, SurveyConfig])
-def test_the_help_of_this_room_fits_a_screen_and_has_an_example(capsys, monkeypatch, command):
-    monkeypatch.setenv("COLUMNS", "100")
-    monkeypatch.setattr(sys, "argv", ["build"])  # the usage begins with it, and pytest's own path fills a line
-    with pytest.raises(SystemExit):
-        parse(lambda words: tyro.cli(command, args=words, prog="python -m scene.build"), ["--help"])
-    lines = capsys.readouterr().out.splitlines()
-    assert len(lines) <= 40
-    assert max(map(len, lines)) <= 100
-    assert any("Example: python -m scene." in line for line in lines)
-
-
-def test_the_words_reach_the_reader_as_they_are():
-    assert parse(lambda words: [*words, "read"], ["--out", "x"]) == ["--out", "x", "read"]
 
 
 def fail(error: BaseException):

@@ -201,30 +201,6 @@ def test_what_a_lidar_in_three_dimensions_sees_is_drawn_about_the_robot(task):
     assert trace.pose.shape[1] == (10 if legs else 0)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (["--scene", "nowhere"], "nowhere: no such scene folder"),
-        (["--tunnel", "nowhere.npz"], "nowhere.npz: no such tunnel file"),
-        (["--tunnel", "metro", "--scene", "s"], "either --scene or --tunnel"),
-        (["--task", "Fly"], "no task 'Fly'; there are"),
-        (["--task", "B2Walk"], "Subterra/B2Walk-v1 has no episode to show"),
-        (["--driver", "nobody", "--tunnel", "control"], "no agent 'nobody'; there are"),
-        (["--lining", "velvet", "--tunnel", "control"], "tunnel 'control' has no lining 'velvet'"),
-        (["--seed", "-1"], "seed must be 0 to"),
-        (["--steps", "0"], "steps must be at least 1"),
-        (["--out", "/dev/null/a.html"], "/dev/null: is a file, so no folder"),
-        (["--out", "a.htm"], "a.htm: must end in .html"),
-    ],
-)
-def test_a_mistake_ends_in_one_sentence_and_status_2(capsys, monkeypatch, tmp_path, arguments, says):
-    monkeypatch.chdir(tmp_path)
-    assert main(arguments) == 2
-    said = capsys.readouterr()
-    assert said.err.startswith(f"error: {says}")
-    assert (said.out, said.err.count("\n")) == ("", 1)
-
-
 def test_the_command_writes_a_page(monkeypatch, tmp_path, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["--task", "TraverseShort", "--tunnel", "control", "--steps", "5", "--out", "a.html"]) == 0

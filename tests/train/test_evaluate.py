@@ -70,38 +70,6 @@ def test_the_command_prints_one_line_of_json_and_nothing_else(trained, tunnel, c
     assert json.loads(line) == {name: value for name, value in saved.items() if name != "schema"}
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("--task", "Subterra/Nowhere-v1"), "no task 'Subterra/Nowhere-v1'"),
-        (("--tunnel", "nowhere.npz"), "nowhere.npz: no such tunnel file"),
-        (("--lining", "velvet"), "no lining 'velvet'"),
-        (("--episodes", "0"), "episodes must be at least 1, got 0"),
-        (("--episodes", "501"), "episodes must be at most 500"),
-        (
-            ("--task", "Subterra/StopAt-v1"),
-            "has learnt Subterra/TraverseShort-v1 (to cover); Subterra/StopAt-v1 asks",
-        ),
-    ],
-)
-def test_a_mistake_on_the_command_line_is_one_sentence_and_status_2(trained, capsys, arguments, message):
-    assert call(evaluate.main, "--policy", str(trained), *arguments) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("error: ")
-    assert message in error
-    assert error.count("\n") == 1
-
-
-def test_without_a_policy_or_a_task_nothing_can_be_scored(capsys):
-    assert call(evaluate.main) == 2
-    assert "a task or a policy must be named" in capsys.readouterr().err
-
-
-def test_a_policy_that_there_is_not_is_refused_with_those_there_are(capsys):
-    assert call(evaluate.main, "--policy", "nobody") == 2
-    assert "nobody: no such policy; released are" in capsys.readouterr().err
-
-
 def test_an_ablation_takes_away_what_it_names_and_nothing_else():
     env, params = st.make("Subterra/StopAtShort-v1", tunnel="open:cast:train:0")
     flat, _ = env.reset(jax.random.key(0), params)

@@ -35,52 +35,6 @@ def test_a_run_folder_holds_everything(trained):
         assert str(trained.parent) not in path.read_text(), f"{path.name} names a path of this machine"
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("--task", "Subterra/Nowhere-v1"), "no task 'Subterra/Nowhere-v1'"),
-        (("--preset", "abacus"), "unknown preset 'abacus'"),
-        (("--minibatches", "7"), "n_envs = 128 cannot be divided into minibatches = 7"),
-        (("--memory", "tape"), "unknown memory 'tape'"),
-        (("--auxiliary",), "auxiliary = True is for memory = gru or along, and memory = none does not read it"),
-        (("--map",), "map = True is for memory = along, and memory = none does not read it"),
-        (("--frames", "8"), "frames = 8 is for memory = stack or along, and memory = none does not read it"),
-        (("--memory", "stack", "--cell", "8"), "cell = 8 is for memory = gru, and memory = stack does not read it"),
-        (("--memory", "along", "--map", "--front", "wide"), "map = True is for front = match, and front = wide"),
-        (("--legs.robots", "3"), "legs are for embodiment = b2, and embodiment = scout drives on wheels"),
-        (
-            ("--embodiment", "b2", "--sensor", "vlp16"),
-            "sensor = vlp16 is for embodiment = scout; with b2 it is planar16",
-        ),
-        (("--embodiment", "b2", "--val", "control"), "val = control is for embodiment = scout; with b2 it is None"),
-        (
-            ("--begin-from", "locate-transformer"),
-            "begin_from = locate-transformer: a localiser, and memory = none takes",
-        ),
-        (
-            ("--begin-from", "TraverseShort-v1", "--hidden", "7"),
-            "begin_from = TraverseShort-v1 has another network: actor.hidden_0.",
-        ),
-        (("--begin-from", "nobody"), "begin_from = nobody: nobody: no such policy"),
-        (("--memory", "gru", "--auxiliary"), "auxiliary = True asks for the way to a goal, and Subterra/"),
-        (("--memory", "along"), "memory = along is for tasks that ask to stop or return, and Subterra/"),
-        (("--unroll", "600"), "unroll = 600 must be shorter than an episode of Subterra/TraverseShort-v1, 600 steps"),
-        (("--steps", "0"), "steps must be at least 1, got 0"),
-        (("--tunnel", "nowhere.npz"), "nowhere.npz: no such tunnel file"),
-        (("--lining", "velvet"), "no lining 'velvet'"),
-        (("--evaluation-episodes", "501"), "evaluation_episodes must be at most 500"),
-    ],
-)
-def test_a_mistake_is_one_sentence_and_status_2_before_anything_is_written(tmp_path, capsys, arguments, message):
-    (tmp_path / "run").mkdir()
-    assert call(navigate.main, "--task", TASK, "--out", str(tmp_path / "run"), *arguments) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("error: ")
-    assert message in error
-    assert error.count("\n") == 1
-    assert not list((tmp_path / "run").iterdir())
-
-
 NOT_A_NUMBER = """
 import dataclasses
 import jax.numpy as jnp
@@ -108,14 +62,6 @@ def test_a_reward_of_a_users_own_that_is_no_number_ends_the_training_in_one_sent
     assert line == (
         "error: iteration 1: the task's reward is not finite (reward_time); a policy learns from finite rewards alone"
     )
-
-
-def test_an_output_that_is_a_file_is_refused(tmp_path, capsys):
-    (tmp_path / "file").write_text("mine")
-    for out in (tmp_path / "file", tmp_path / "file" / "run"):
-        assert call(navigate.main, "--out", str(out)) == 2
-        assert "is a file" in capsys.readouterr().err
-    assert (tmp_path / "file").read_text() == "mine"
 
 
 def test_a_folder_that_holds_a_run_is_not_overwritten_unasked(trained, capsys):

@@ -12,8 +12,6 @@ from benchmarks.throughput import __main__ as command
 from benchmarks.throughput.config import ThroughputConfig
 from benchmarks.throughput.report import Result
 
-QUICK = ("--n", "2", "--steps", "1", "--repeats", "1", "--poses", "20", "--peers", "none")
-
 
 def run_here(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     monkeypatch.setattr(sys, "argv", ["throughput", *arguments])
@@ -41,23 +39,6 @@ def test_one_run_writes_speeds_and_the_gate(tmp_path, monkeypatch):
     assert sorted(path.name for path in (tmp_path / "speed").iterdir()) == ["records.json", "throughput.json"]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "named"),
-    [
-        (("--task", "Subterra/Nowhere-v1"), "Nowhere"),
-        (("--lining", "velvet"), "velvet"),
-        (("--tunnel", "nowhere.npz"), "nowhere.npz"),
-        (("--sensor", "nowhere"), "no sensor 'nowhere'"),
-        (("--steps", "0"), "--steps"),
-        (("--n", "0"), "0"),
-    ],
-)
-def test_a_mistake_is_one_sentence_and_status_2(monkeypatch, capsys, arguments, named):
-    assert run_here(monkeypatch, *QUICK, *arguments) == 2
-    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
-    assert named in line
-
-
 def test_several_tunnels_are_measured_together_and_compared_one_by_one(tmp_path, monkeypatch, capsys):
     quick = ("--n", "4", "--steps", "1", "--repeats", "1", "--poses", "20")
     several = ("--task", "Subterra/StopAtShort-v1", "--tunnel", "open:cast:train:0-1", "--copies", "2")
@@ -70,11 +51,6 @@ def test_several_tunnels_are_measured_together_and_compared_one_by_one(tmp_path,
     true_scan = reference.lidar.scan
     monkeypatch.setattr(reference.lidar, "scan", lambda *args, **rest: true_scan(*args, **rest) + 0.01)
     assert run_here(monkeypatch, *quick, *several) == 1
-
-
-def test_a_peer_takes_one_tunnel(monkeypatch, capsys):
-    assert run_here(monkeypatch, "--n", "2", "--tunnel", "open:cast:train:0-1", "--peers", "jaxnav") == 2
-    assert "error: --peers" in capsys.readouterr().err
 
 
 def test_a_peer_that_was_asked_for_and_is_not_there_is_a_mistake(monkeypatch, capsys):

@@ -130,28 +130,6 @@ def test_the_same_config_gives_the_same_bytes(config, trace, tmp_path):
             assert path.read_bytes() == (other / path.name).read_bytes(), path.name
 
 
-@pytest.mark.parametrize(
-    ("arguments", "sentence"),
-    [
-        (("--task", "Fly"), "error: no task 'Fly'; there are"),
-        (("--agent", "nobody"), "error: no agent 'nobody'; there are random"),
-        (("--agent", "policy:nothing"), "error: nothing: no such policy"),
-        (("--episode", "500"), "error: episodes must be 1 to 500, got 501"),
-        (("--steps", "0"), "error: steps must be at least 1, got 0"),
-        (("--seed", "-1"), "error: seed must be at least 0, got -1"),
-        (("--tunnel", "no.npz"), "error: no.npz: no such tunnel file"),
-        (("--lining", "velvet"), "error: tunnel 'open:train:0' has no lining 'velvet'"),
-    ],
-)
-def test_what_cannot_be_had_is_one_sentence_and_leaves_nothing(capsys, tmp_path, arguments, sentence):
-    out = tmp_path / "out"
-    assert main(["--out", str(out), "--task", "StopAtShort", *arguments]) == 2
-    told = capsys.readouterr().err
-    assert told.startswith(sentence)
-    assert told.count("\n") == 1
-    assert not out.exists()
-
-
 def test_a_missing_library_and_a_place_that_cannot_be_written_are_told(monkeypatch, capsys, tmp_path):
     blocked = tmp_path / "file"
     blocked.write_text("")
