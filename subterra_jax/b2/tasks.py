@@ -158,7 +158,7 @@ def make_mission(
     physics = MujocoPhysics() if engine == "mujoco" else Physics()
     walker, walking = make(WALK, tunnel, lining, scene=scene, physics=physics, driven=True, **parts)
     if scene is not None:
-        relief = relief or Relief.from_scene(scene, lining or "pockets")
+        relief = relief or Relief.from_plan(load_tunnel(Path(scene) / "tunnel.npz"), lining)
         if engine == "mujoco":
             walker = walk_in_scene(walker, Path(scene), lining)
     spatial = not (isinstance(sensor, str) and sensor == SENSORS[0])

@@ -35,22 +35,6 @@ def spinning(elevations: Float[np.ndarray, "n_rings"], n_columns: int) -> Float[
     return _unit(np.repeat(azimuth, len(elevations)), np.tile(elevations, n_columns))
 
 
-def vlp16(n_columns: int = 1800) -> Float[np.ndarray, "n 3"]:
-    """Return the beams of a Velodyne VLP-16: 16 rings from -15° to 15°.
-
-    Source: VLP-16 user manual; at 10 turns/s it fires 1,808 times in a turn.
-    """
-    return spinning(np.deg2rad(np.arange(-15.0, 16.0, 2.0)), n_columns)
-
-
-def os1(n_columns: int = 1024) -> Float[np.ndarray, "n 3"]:
-    """Return the beams of an Ouster OS1-64: 64 rings evenly over 45°, the uppermost first.
-
-    Source: OS1 hardware user manual. Its four columns of beams with slightly different azimuths are left out.
-    """
-    return spinning(np.deg2rad(np.linspace(22.5, -22.5, 64)), n_columns)
-
-
 def rosette(
     n_beams: int = 24_000,
     start: float = 0.0,

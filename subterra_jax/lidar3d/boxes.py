@@ -41,7 +41,7 @@ class Boxes:
 def split_boxes(surface: Triangles) -> tuple[Triangles, Boxes]:
     """Return a surface without the boxes in it, and these.
 
-    Boxes are runs of 12 triangles between 8 vertices as `read_scene` makes them of a scene's boxes.
+    Boxes are runs of 12 triangles between 8 vertices as `rolled` makes them of track and furniture.
     """
     faces, vertices, n = surface.faces, surface.vertices, len(BOX_FACES)
     nothing = Boxes(np.zeros((0, 3)), np.zeros((0, 3, 3)))

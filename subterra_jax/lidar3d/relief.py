@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -12,7 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from subterra_jax.lidar3d.cells import N_FACES, N_WEDGES, STEP_BITS, X_BITS, Cells, sort_triangles
 from subterra_jax.lidar3d.rolled import raise_shell
-from subterra_jax.lidar3d.surface import SMALL, Axis, Triangles, read_axis, read_scene
+from subterra_jax.lidar3d.surface import Axis, Triangles
 from subterra_jax.lidar3d.upright import CROWN, raise_walls
 from subterra_jax.tunnel.plan import TunnelPlan
 
@@ -29,7 +28,7 @@ ARRAYS = ("frame", "link", "cell", "entry", "vertex", "box")
 class Relief:
     """Every triangle of a bore's surface, in cells around its axis; or of several bores.
 
-    Two reliefs whose arrays have the same shapes share one compiled program; see `Relief.pad_to`.
+    Two reliefs whose arrays have the same shapes share one compiled program.
 
     Attributes:
         length: Length of the axis, m; `()`, or `(k,)` in a stack of k, as the next two.
@@ -56,24 +55,8 @@ class Relief:
     n_x: int = struct.field(pytree_node=False)
 
     @classmethod
-    def from_scene(cls, folder: str | Path, lining: str = "pockets", *, leave_out: tuple[str, ...] = SMALL) -> "Relief":
-        """Put a scene folder's visible surface on the device; takes some seconds per kilometre.
-
-        Args:
-            folder: A scene folder, as `scene.build` writes it.
-            lining: `smooth`, `pockets`, or `furnished`, which brings the furniture along.
-            leave_out: Kinds of geom to leave out; by default the rails' clips and the lining's bolts.
-
-        Raises:
-            TunnelError: The lining is unknown, or a file of the folder is missing or damaged.
-        """
-        folder = Path(folder)
-        axis = read_axis(folder / "bore.npz")
-        return cls.from_triangles(axis, read_scene(folder, lining, leave_out))
-
-    @classmethod
     def from_plan(cls, plan: TunnelPlan, lining: str | None = None, *, crown: float = CROWN) -> "Relief":
-        """Put a tunnel on the device; needs no scene folder.
+        """Put a tunnel on the device; takes some seconds per kilometre.
 
         A plan with a shell gives the bore as surveyed, with recesses, track and furniture. One without knows its walls
         at the LiDAR's height alone: they stand upright between floor and crown, and level beams meet what the planar
@@ -142,16 +125,6 @@ class Relief:
 
     def _with_numbers(self, length: Any, first_block: Any, n_blocks: Any) -> "Relief":
         return dataclasses.replace(self, length=length, first_block=first_block, n_blocks=n_blocks)
-
-    def pad_to(self, other: "Relief") -> "Relief":
-        """Pad the arrays to at least another relief's sizes; two reliefs padded by each other agree in shape."""
-
-        def grown(mine: Array, theirs: Array) -> Array:
-            room = [(0, max(0, b - a)) for a, b in zip(mine.shape, theirs.shape, strict=True)]
-            return _put(np.pad(np.asarray(mine), room), mine.dtype)
-
-        sizes: dict[str, Any] = {name: grown(getattr(self, name), getattr(other, name)) for name in ARRAYS}
-        return dataclasses.replace(self, **sizes)
 
 
 def stack_reliefs(reliefs: Sequence[Relief]) -> Relief:

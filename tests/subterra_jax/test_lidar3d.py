@@ -1,5 +1,6 @@
 """3-D LiDAR: tubes and boxes with known answers, and float64 brute force over every triangle of a rough bend."""
 
+import dataclasses
 import re
 from functools import partial
 from pathlib import Path
@@ -13,7 +14,7 @@ import subterra_jax as st
 from subterra_jax import lidar, lidar3d, native
 from subterra_jax.lidar import nvidia
 from subterra_jax.lidar3d import beams, casting, finding, fused
-from subterra_jax.lidar3d.relief import Relief, stack_reliefs
+from subterra_jax.lidar3d.relief import ARRAYS, Relief, stack_reliefs
 from subterra_jax.lidar3d.surface import BOX_CORNERS, BOX_FACES, Axis, Triangles
 from tests.subterra_jax import surfaces
 from tests.subterra_jax.lowering import for_nvidia
@@ -59,10 +60,11 @@ def reliefs(bend):
     round_tube = surfaces.tube(axis, RADIUS, 360, 31)
     things = (surfaces.box((20.0, 0.5, -1.0), (0.25, 0.2, 0.3)), surfaces.box((35.0, 0.0, 0.0), (0.02, 0.02, 1.9)))
     made = [relief_of(axis, round_tube), relief_of(axis, surfaces.together(round_tube, *things)), relief_of(*bend)]
-    sizes = made[0]
-    for other in made[1:]:
-        sizes = sizes.pad_to(other)
-    return dict(zip(("tube", "things", "bend"), (one.pad_to(sizes) for one in made), strict=True))
+    for name in ARRAYS:  # of the same sizes they share one program
+        sizes = np.max([getattr(one, name).shape for one in made], axis=0)
+        fill = lambda a, sizes=sizes: jnp.pad(a, [(0, n - m) for n, m in zip(sizes, a.shape, strict=True)])  # noqa: E731
+        made = [dataclasses.replace(one, **{name: fill(getattr(one, name))}) for one in made]
+    return dict(zip(("tube", "things", "bend"), made, strict=True))
 
 
 def random_directions(rng: np.random.Generator, *shape: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Cells list every triangle that comes near them, and files that are missing or spoiled are named."""
+"""Cells list every triangle that comes near them."""
 
 import numpy as np
 import pytest
@@ -111,25 +111,3 @@ def test_a_surface_away_from_the_axis_is_refused():
     far = surfaces.box((500.0, 0.0, 0.0), (1.0, 1.0, 1.0))
     with pytest.raises(ValueError, match="no triangle lies along the axis"):
         Relief.from_triangles(surface.Axis(**axis), surface.Triangles(*far))
-
-
-def test_what_is_missing_or_spoiled_in_a_scene_folder_is_named(tmp_path):
-    with pytest.raises(TunnelError, match=r"bore\.npz"):
-        Relief.from_scene(tmp_path)
-    (tmp_path / "bore.npz").write_bytes(b"no archive")
-    with pytest.raises(TunnelError, match=r"bore\.npz: not a bore file"):
-        surface.read_axis(tmp_path / "bore.npz")
-    np.savez(tmp_path / "bore.npz", schema="subterra.bore/0")
-    with pytest.raises(TunnelError, match=r"older Subterra \(schema subterra\.bore/0"):
-        surface.read_axis(tmp_path / "bore.npz")
-    np.savez(tmp_path / "bore.npz", schema="subterra.bore/1", **surfaces.axis_of(10.0))
-    with pytest.raises(TunnelError, match=r"scene\.xml: no such scene"):
-        Relief.from_scene(tmp_path)
-    (tmp_path / "scene.xml").write_text("<mujoco><worldbody/></mujoco")
-    with pytest.raises(TunnelError, match=r"scene\.xml: MuJoCo refuses the scene"):
-        Relief.from_scene(tmp_path)
-    with pytest.raises(TunnelError, match="there is no lining 'brick'"):
-        Relief.from_scene(tmp_path, "brick")
-    (tmp_path / "scene.xml").write_text("<mujoco><worldbody/></mujoco>")
-    with pytest.raises(TunnelError, match=r"lining_smooth\.ply: no such mesh"):
-        Relief.from_scene(tmp_path, "smooth")
