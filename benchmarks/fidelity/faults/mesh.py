@@ -7,7 +7,6 @@ from typing import Any
 
 import mujoco
 import numpy as np
-import pymeshlab
 import trimesh
 from scipy.spatial import cKDTree
 
@@ -231,6 +230,8 @@ def add_vertex_noise(site: Site, fault: Fault) -> Candidate:
 @fault_kind("coarse", "share of the faces that smoothing and decimation take", signed=False)
 def coarsen(site: Site, fault: Fault) -> Candidate:
     """Smooths (Laplace, the more the larger the share) and then reduces the number of faces."""
+    import pymeshlab
+
     share = fault.size
 
     def smooth(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
