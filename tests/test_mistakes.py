@@ -195,7 +195,7 @@ MISTAKES = {
 }
 COMMANDS = sorted({words.split()[0] for words in MISTAKES} - {"benchmarks.fidelity", "benchmarks.slam"}) + [
     f"benchmarks.fidelity{part}"
-    for part in ("", " run", " controls", " sweep", " split", " windows", " faults")
+    for part in ("", " run", " controls", " split", " windows", " faults")
 ] + [f"benchmarks.slam{part}" for part in ("", " arena", " board", " check", " score")]  # fmt: skip
 
 

@@ -6,19 +6,18 @@ Example: python -m benchmarks.fidelity run --scene build/tunnel --recording held
 import functools
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
-from benchmarks.fidelity import judge, outside, scoring
+from benchmarks.fidelity import judge, outside
 from benchmarks.fidelity.case import Case, case_hash
 from benchmarks.fidelity.faults import ladder
-from benchmarks.fidelity.faults.runner import Bench, is_bold, is_ranked, judge_outcomes, list_jobs, run_jobs
+from benchmarks.fidelity.faults.runner import Bench, is_bold, judge_outcomes, list_jobs, run_jobs
 from benchmarks.fidelity.files import FidelityError, read_kept, write_json
 from benchmarks.fidelity.inputs import (
-    FOREIGN,
     Inputs,
     SplitConfig,
     complete_inputs,
@@ -28,14 +27,13 @@ from benchmarks.fidelity.inputs import (
 )
 from benchmarks.fidelity.judge import Judgement
 from benchmarks.fidelity.leaks import find_leaks
-from benchmarks.fidelity.registry import Value, evaluate
+from benchmarks.fidelity.registry import Value
 from benchmarks.fidelity.report import write_report
 from scene.errors import require_input
 from subterra_jax.host.command import parse, run_command
 from subterra_jax.host.files import require_folder
 
 CONTROLS_SCHEMA = "subterra.fidelity-controls/1"
-SWEEP_SCHEMA = "subterra.fidelity-sweep/1"
 _PROG = "python -m benchmarks.fidelity"
 
 
@@ -54,13 +52,6 @@ class ControlsConfig(Inputs):
     bold_only: bool = False  # Run only the doses that must fail.
     processes: int = 2  # Number of controls at a time.
     foreign: Path | None = None  # Scene folder of another tunnel of the same class, for N33; made where not given.
-
-
-@dataclass(frozen=True)
-class SweepConfig(Inputs):
-    """Runs of the sweep that compute all geometry anew."""
-
-    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)  # Seeds of such runs; empty for none.
 
 
 @dataclass(frozen=True)
@@ -149,36 +140,6 @@ def _check_controls(config: ControlsConfig) -> None:
         require_input(config.foreign / "manifest.json")
 
 
-def run_sweep(config: SweepConfig) -> None:
-    """Moves thresholds and seeds, and says how far the scores follow.
-
-    The results of `controls` in `--out` take part in the order that must be kept.
-
-    Example: python -m benchmarks.fidelity sweep --seeds 0 1 2 --out out/fidelity
-    """
-    if wrong := [seed for seed in config.seeds if seed < 0]:
-        raise FidelityError(f"seeds must be at least 0, got {wrong[0]}")
-    opened = open_case(config)
-    base, foreign = opened.values["base"], config.out / FOREIGN
-    bench = Bench(opened.case, base, config.out / "controls", foreign if foreign.exists() else None)
-    candidates = opened.values | {one.job.name: one.values for one in bench.kept() if is_ranked(one.job)}
-    rows = scoring.sweep_thresholds(candidates) + scoring.compare_seeds(_other_seeds(opened, config.seeds), base)
-    content = {"schema": SWEEP_SCHEMA, "key": case_hash(opened.case), "rows": rows,
-               "summary": scoring.summarise(rows)}  # fmt: skip
-    write_json(config.out / "sweep.json", content)
-    _print_summary(_write_report(opened))
-
-
-def _other_seeds(opened: OpenCase, seeds: tuple[int, ...]) -> dict[str, dict[str, Value]]:
-    """Return the values with other seeds, by seed."""
-    base, runs = opened.values["base"], {}
-    for seed in seeds:
-        same, fresh = seed == opened.case.seed, replace(opened.case.fresh(), seed=seed)
-        runs[str(seed)] = base if same else evaluate(fresh, judge.geometry_categories(), base)
-        print(f"seed {seed}: done", flush=True)
-    return runs
-
-
 def run_windows(inputs: Inputs) -> None:
     """Judges a scene by its worst windows alone, in seconds.
 
@@ -226,12 +187,11 @@ def run_split(config: SplitCommand) -> None:
 def _write_report(opened: OpenCase) -> dict[str, Any]:
     inputs, folder = opened.inputs, opened.inputs.out
     key = case_hash(opened.case)
-    swept = read_kept(folder / "sweep.json", SWEEP_SCHEMA, key) or None
     rows = read_kept(folder / "controls.json", CONTROLS_SCHEMA, key).get("rows")
     leaks = find_leaks(opened.case, opened.values["base"])
     judgement = judge.make_judgement(opened.values, leaks, rows, inputs.strict, opened.judgement.windows)
     judgement = judge.add_outside(judgement, opened.case, folder, inputs.strict)
-    return write_report(folder, opened.case, inputs, judgement, rows, swept)
+    return write_report(folder, opened.case, inputs, judgement, rows)
 
 
 def _print_summary(report: dict[str, Any]) -> None:
@@ -254,8 +214,7 @@ def main() -> int:
     if len(sys.argv) == 1:
         sys.argv.append("run")
     actions: dict[str, Callable[[Any], None]] = {
-        "run": run, "controls": run_controls, "sweep": run_sweep,
-        "split": run_split, "windows": run_windows, "faults": run_faults,
+        "run": run, "controls": run_controls, "split": run_split, "windows": run_windows, "faults": run_faults,
     }  # fmt: skip
     commands = {name: _without_prefix(action) for name, action in actions.items()}
 

@@ -1,15 +1,12 @@
-"""Scores, categories, the global figure and the verdict; and how far they depend on thresholds and seed."""
+"""Scores, categories, the global figure and the verdict."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from scipy.stats import kendalltau, qmc
 
 from benchmarks.fidelity import table
 from benchmarks.fidelity.registry import Value
-from benchmarks.fidelity.table import Map, Metric
+from benchmarks.fidelity.table import Metric
 
 GATE_FLOOR = 50.0  # points; a gate below it caps its category at it
 MOST_MISSING = 0.30  # share of a category's metrics
@@ -17,16 +14,7 @@ PASS_GLOBAL = 90.0
 PASS_CATEGORY = 70.0
 PASS_LEAD = 10.0  # points above the null tube
 PASS_SKILL = 0.3
-FACTORS = (0.9, 1.1)  # of the thresholds in the sweep
-DRAWS = 128
-COMMON_LIMIT = 2.5  # points
-COMMON_CATEGORY_LIMIT = 7.0
-INDEPENDENT_LIMIT = 1.0
-SEED_LIMIT = 0.2
-SEED_CATEGORY_LIMIT = 1.0
-TAU_LIMIT = 0.95
 
-Maps = dict[str, Map]
 Values = dict[str, Value]
 
 
@@ -62,28 +50,25 @@ class Scored:
         return float(np.mean(known)) if known else None
 
 
-def score_one(metric: Metric, value: Value, map: Map | None = None) -> Score:
-    """Scores a value through its map; a failed computation scores 0, a missing value has no score."""
+def score_one(metric: Metric, value: Value) -> Score:
+    """Scores a value through its metric's map; a failed computation scores 0, a missing value has no score."""
     if not metric.scored:
         return Score(metric, value, None)
     if value.value is None:
         return Score(metric, value, 0.0 if value.failed else None)
-    return Score(metric, value, (map or metric.map).score(value.value))
+    return Score(metric, value, metric.map.score(value.value))
 
 
-def score_all(
-    values: Values, maps: Maps | None = None, strict: bool = False, rows: dict[str, Metric] | None = None
-) -> Scored:
+def score_all(values: Values, strict: bool = False, rows: dict[str, Metric] | None = None) -> Scored:
     """Scores every metric and every category.
 
     Args:
         values: Raw values of all rows by id.
-        maps: Maps in place of the table's, for the sweep.
         strict: Count missing values as 0.
-        rows: Rows in place of the table: of a calibration, or with metrics from outside.
+        rows: Rows in place of the table's, with metrics from outside.
     """
     rows = rows or table.load()
-    scores = {id: score_one(rows[id], values[id], (maps or {}).get(id)) for id in rows}
+    scores = {id: score_one(rows[id], values[id]) for id in rows}
     categories = {
         name: _category_score([s for s in scores.values() if s.metric.category == name], strict)
         for name in table.CATEGORIES
@@ -153,87 +138,3 @@ def reasons_against(
     reasons += [f"negative control {id} was not detected" for id in undetected]
     reasons += [f"invariance control {id} moved the scores" for id in loud]
     return reasons + [f"leak: {leak}" for leak in leaks]
-
-
-# The sweep: other thresholds and seeds.
-
-
-def threshold_maps(seed: int = 0) -> Iterator[tuple[str, str, Maps]]:
-    """Yields kind, name and maps of every run: common mode, one category at a time, then independent draws."""
-    rows = table.load()
-    for factor in FACTORS:
-        yield "common", f"x{factor}", {id: row.map.scaled(factor) for id, row in rows.items()}
-    for name in table.CATEGORIES:
-        for factor in FACTORS:
-            maps = {id: row.map.scaled(factor) for id, row in rows.items() if row.category == name}
-            yield "category", f"{name} x{factor}", maps
-    scored = [id for id, row in rows.items() if row.scored]
-    draws = qmc.LatinHypercube(len(scored), seed=seed).random(DRAWS)
-    for number, draw in enumerate(FACTORS[0] + (FACTORS[1] - FACTORS[0]) * draws):
-        yield "independent", f"draw {number}", {id: rows[id].map.scaled(k) for id, k in zip(scored, draw, strict=True)}
-
-
-def sweep_thresholds(candidates: dict[str, Values]) -> list[dict[str, Any]]:
-    """Scores all candidates through every run's maps.
-
-    Args:
-        candidates: Raw values by name; the first is the reconstruction. Null tubes, and whatever else scores less
-            save `ceiling`, must stay below it.
-    """
-    before = {name: score_all(values) for name, values in candidates.items()}
-    return [
-        _sweep_row(kind, name, before, {c: score_all(values, maps) for c, values in candidates.items()})
-        for kind, name, maps in threshold_maps()
-    ]
-
-
-def compare_seeds(runs: dict[str, Values], base: Values) -> list[dict[str, Any]]:
-    """Return the rows of runs that computed the reconstruction anew with other seeds."""
-    before = {"base": score_all(base)}
-    return [_sweep_row("seed", name, before, {"base": score_all(values)}) for name, values in runs.items()]
-
-
-def summarise(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return the largest moves by kind, and whether each keeps its limit; `sweepable` scored metrics move at all."""
-    maps = [row.map for row in table.load().values() if row.scored]
-    kinds: dict[str, Any] = {"sweepable": float(np.mean([map.scaled(1.1) != map for map in maps]))}
-    for kind in ("common", "category", "independent", "seed"):
-        own = [row for row in rows if row["kind"] == kind]
-        if not own:
-            continue
-        moves, worst = [row["delta"] for row in own], max(row["category_delta"] for row in own)
-        kinds[kind] = {
-            "runs": len(own), "least": min(moves), "most": max(moves), "sd": float(np.std(moves)),
-            "category": worst, "lower": own[0]["lower"], "order_kept": all(row["order_kept"] for row in own),
-            "verdicts": sorted({row["meets"] for row in own}), "least_tau": min(row["tau"] for row in own),
-            "within": _within_limits(kind, own, moves, worst),
-        }  # fmt: skip
-    return kinds
-
-
-def _within_limits(kind: str, own: list[dict[str, Any]], moves: list[float], worst: float) -> bool:
-    kept = all(row["order_kept"] and row["tau"] >= TAU_LIMIT for row in own)
-    if kind == "independent":
-        return kept and max(moves) - min(moves) <= INDEPENDENT_LIMIT
-    if kind == "seed":
-        spread = max(np.std([row["categories"][c] or 0.0 for row in own]) for c in own[0]["categories"])
-        return bool(np.std(moves) <= SEED_LIMIT and spread <= SEED_CATEGORY_LIMIT)
-    return kept and max(map(abs, moves)) <= COMMON_LIMIT and worst <= COMMON_CATEGORY_LIMIT
-
-
-def _sweep_row(kind: str, name: str, before: dict[str, Scored], after: dict[str, Scored]) -> dict[str, Any]:
-    first = next(iter(before))
-    old, new = before[first], after[first]
-    moved = {c: (new.categories[c] or 0.0) - (v or 0.0) for c, v in old.categories.items()}
-    worst = max(moved, key=lambda c: abs(moved[c]))
-    others = {c: s.overall or 0.0 for c, s in before.items() if c not in (first, "ceiling")}
-    lower = [c for c, score in others.items() if c.startswith("null") or score < (old.overall or 0.0)]
-    ranks = [[s.overall or 0.0 for s in scored.values()] for scored in (before, after)]
-    return {
-        "kind": kind, "run": name, "global": new.overall, "delta": (new.overall or 0.0) - (old.overall or 0.0),
-        "category_delta": abs(moved[worst]), "category": worst, "categories": new.categories,
-        "meets": not reasons_against(new, after.get("null"), None, [], [], []),
-        "order_kept": all((new.overall or 0.0) > (after[c].overall or 0.0) for c in lower), "lower": len(lower),
-        "tau": float(kendalltau(*ranks).statistic) if len(before) > 2 else 1.0,
-        "saturated": new.saturated, "others": {c: s.overall for c, s in after.items() if c != first},
-    }  # fmt: skip

@@ -46,17 +46,6 @@ class Map:
             return 100.0 if distance <= self.good else 0.0
         return 100.0 * min(max((self.bad - distance) / (self.bad - self.good), 0.0), 1.0)
 
-    def scaled(self, factor: float) -> "Map":
-        """Return the map with both thresholds times a factor.
-
-        A share moves by its shortfall from 1; pass or fail does not move.
-        """
-        if self.kind == "U" and max(self.good, self.bad) <= 1.0:
-            return replace(self, good=1.0 - factor * (1.0 - self.good), bad=1.0 - factor * (1.0 - self.bad))
-        if self.kind in "DUB":
-            return replace(self, good=factor * self.good, bad=factor * self.bad)
-        return self
-
     def __str__(self) -> str:
         """Return the map as its maker is called."""
         good, bad, target = (np.format_float_positional(v, trim="-") for v in (self.good, self.bad, self.target))

@@ -81,11 +81,6 @@ class Bench:
     def own(self) -> str:
         return case_hash(self.case)
 
-    def kept(self) -> list[Outcome]:
-        """Return the kept outcomes of this base, in the order of `list_jobs`."""
-        jobs = list_jobs(foreign=self.foreign is not None)
-        return [kept for job in jobs if (kept := read_outcome(self.folder, job, self.key(job))) is not None]
-
 
 def list_jobs(only: tuple[str, ...] = (), foreign: bool = True) -> list[Job]:
     """Return every control at every dose; N33 only where a foreign tunnel is at hand."""
@@ -239,8 +234,3 @@ def _spearman(same: list[dict[str, Any]], control: kinds.Control, base: Judgemen
     before = [base.scored["base"].categories[c] or 0.0 for c in control.falls]
     scores = [np.mean(before)] + [np.mean([row["categories"][c] or 0.0 for c in control.falls]) for row in order]
     return float(spearmanr(range(len(scores)), scores).statistic)
-
-
-def is_ranked(job: Job) -> bool:
-    """Return True where an outcome has a place in the order: invariances change nothing, cheats no geometry."""
-    return bool(kinds.load_controls()[job.control].falls)

@@ -67,7 +67,6 @@ def report_content(
     inputs: Inputs,
     judgement: Judgement,
     controls: list[dict[str, Any]] | None = None,
-    sweep: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Return the content of `report.json`."""
     scored, null = judgement.scored["base"], judgement.scored["null"]
@@ -108,7 +107,6 @@ def report_content(
             "undetected": judge.undetected(rows),
             "loud": judge.loud(rows),
         } if controls is not None else None,
-        "sweep": sweep,
     }  # fmt: skip
 
 
@@ -210,16 +208,13 @@ def write_report(
     inputs: Inputs,
     judgement: Judgement,
     controls: list[dict[str, Any]] | None,
-    swept: dict[str, Any] | None,
 ) -> dict[str, Any]:
     """Writes every form of the report and returns its content."""
-    content = report_content(case, inputs, judgement, controls, swept["summary"] if swept else None)
+    content = report_content(case, inputs, judgement, controls)
     rows = controls or []
     write_json(folder / "report.json", content)
     write_metrics(folder, content)
-    write_categories(folder, content)
     write_controls(folder, rows)
-    write_sweep(folder, swept["rows"] if swept else [])
     figures = draw_all(folder / "figures", Sheet(case, content))
     write_html(folder, content, figures, rows)
     return content
@@ -248,17 +243,6 @@ def write_metrics(folder: Path, report: dict[str, Any]) -> Path:
     return write_csv(folder / "metrics.csv", columns, rows)
 
 
-def write_categories(folder: Path, report: dict[str, Any]) -> Path:
-    """Writes `categories.csv`: a row per category, with a column for the score with metrics from outside, if any."""
-    columns: tuple[str, ...] = ("category", "name", "score", "null", "ceiling")
-    rows = [{"category": id, **entry} for id, entry in report["categories"].items()]
-    if report["outside"] is not None:
-        columns += ("score_with_outside",)
-        for row in rows:
-            row["score_with_outside"] = report["outside"]["categories"].get(row["category"], row)["score"]
-    return write_csv(folder / "categories.csv", columns, rows)
-
-
 def write_controls(folder: Path, rows: list[dict[str, Any]]) -> Path:
     flat = [
         {
@@ -275,12 +259,6 @@ def write_controls(folder: Path, rows: list[dict[str, Any]]) -> Path:
     columns = ("id", "kind", "corruption", "dose", "bold", "verdict", "detected", "quiet", "spearman", "overall",
                "short", "moved", "evaluated", "why", *(f"fall_{c}" for c in table.CATEGORIES))  # fmt: skip
     return write_csv(folder / "controls.csv", columns, flat)
-
-
-def write_sweep(folder: Path, rows: list[dict[str, Any]]) -> Path:
-    columns = ("kind", "run", "global", "delta", "category", "category_delta", "meets", "order_kept", "tau",
-               "saturated")  # fmt: skip
-    return write_csv(folder / "sweep.csv", columns, rows)
 
 
 def _join_pairs(entries: dict[str, str]) -> str:

@@ -16,11 +16,10 @@ from matplotlib.patches import Patch
 
 from benchmarks.fidelity import scoring
 from benchmarks.fidelity.case import Case
-from benchmarks.fidelity.derive.axis import reference_curve
 from benchmarks.fidelity.derive.beams import returns
 from benchmarks.fidelity.derive.curve import candidate_curve, cast_profile
 from benchmarks.fidelity.derive.distances import VOXEL_EDGE, Occupied, occupied_voxels
-from benchmarks.fidelity.derive.sections import sections, truth_bore_caster
+from benchmarks.fidelity.derive.sections import truth_bore_caster
 from benchmarks.fidelity.table import Need
 from benchmarks.fidelity.windows.deviation import CELL, Unrolled, bore_caster
 from benchmarks.fidelity.windows.measures import Source, unrolled
@@ -50,7 +49,6 @@ AGREE, ONLY_MESH, ONLY_CLOUD = "#009e73", "#d55e00", "#0072b2"  # the paper's gr
 CLASSES = ListedColormap([AGREE, ONLY_MESH, ONLY_CLOUD])  # of a map of agreement
 DIVERGING = LinearSegmentedColormap.from_list("error", ["#0072b2", "#f7f7f7", "#d55e00"])
 _LIMIT = 5.0  # cm
-_SLICE = 0.15  # m
 _TURN = (-180, -90, 0, 90, 180)  # deg
 
 
@@ -89,35 +87,6 @@ def draw_categories(sheet: Sheet) -> Drawn:
     scored = sum(m["score"] is not None for m in sheet.report["metrics"])
     note = sheet.note(scored).replace("n =", "Scored metrics n =")
     return figure, "Categories, sorted; dotted: least score for PASS." + note
-
-
-def draw_sections(sheet: Sheet) -> Drawn:
-    cut = sections(sheet.case)
-    rows = np.linspace(0, len(cut.station) - 1, 10).astype(int)[1:-1]
-    local = None if sheet.case.hold is None else reference_curve(sheet.case).local(returns(sheet.case).points)
-    figure, axes = plt.subplots(2, 4, figsize=(12, 6.6), layout="constrained", sharex=True, sharey=True)
-    count = 0
-    for axis, row in zip(axes.flat, rows, strict=True):
-        if local is not None:
-            near = local[np.abs(local[:, 0] - cut.station[row]) < _SLICE]
-            count += len(near)
-            axis.plot(near[:, 1], near[:, 2], ".", color=ORANGE, ms=1.2, rasterized=True)
-        across, above = np.cos(cut.angle), np.sin(cut.angle)
-        wall, real = ((radius * across, radius * above) for radius in (cut.judged[row], cut.reference[row]))
-        between = (np.append(ours, theirs[::-1]) for ours, theirs in zip(wall, real, strict=True))
-        axis.fill(*between, color=RED, alpha=0.25, lw=0)
-        axis.plot(*real, color=INK, lw=0.9)
-        axis.plot(*wall, color=BLUE, lw=0.9)
-        axis.set(title=f"{cut.station[row]:.1f} m", aspect="equal")
-    names = (("reconstruction", BLUE), ("reference", INK), ("held-out points", ORANGE), ("between the two", RED))
-    lines = [plt.Line2D([], [], color=colour, label=name) for name, colour in names]
-    figure.legend(handles=lines, loc="outside lower center", ncol=4, frameon=False)
-    for axis in axes[1]:
-        axis.set(xlabel="left, m")
-    for axis in axes[:, 0]:
-        axis.set(ylabel="up, m")
-    caption = "Cross-sections; shaded: over- and under-break between reconstruction and reference."
-    return figure, caption + sheet.note(count)
 
 
 # Voxels of the bore's shell, and the voxels in which cloud and mesh disagree (the paper's Fig. 3).
@@ -283,7 +252,6 @@ FIGURES: tuple[tuple[str, Draw, Need | None], ...] = (  # with the reference tha
     ("categories", draw_categories, None),
     ("voxels", draw_projections, "hold"),
     ("mismatch", draw_mismatch, "hold"),
-    ("sections", draw_sections, "reference"),
 )
 
 

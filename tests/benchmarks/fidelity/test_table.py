@@ -59,13 +59,6 @@ def test_a_map_scores_as_the_specification_says(map: Map, value: float, score: f
     assert map.score(value) == pytest.approx(score)
 
 
-def test_a_share_moves_by_its_shortfall_and_never_past_one() -> None:
-    moved = U(0.85, 0.97).scaled(1.1)
-    assert (moved.good, moved.bad) == (pytest.approx(0.967), pytest.approx(0.835))
-    assert D(1, 3).scaled(1.1) == Map("D", pytest.approx(1.1), pytest.approx(3.3))
-    assert P.scaled(1.1) == P
-
-
 def test_the_worst_stretch_of_a_metric_along_the_tunnel_is_kept_with_its_place() -> None:
     station = np.arange(0.0, 50.0, 0.5)
     error = np.where((station >= 20.0) & (station < 30.0), 0.3, 0.1)

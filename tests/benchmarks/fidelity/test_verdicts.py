@@ -1,4 +1,4 @@
-"""Sweep, verdicts of controls and all written forms, on values that are made to be known."""
+"""Verdicts of controls and all written forms, on values that are made to be known."""
 
 import csv
 import json
@@ -9,14 +9,11 @@ import pytest
 
 from benchmarks.fidelity import judge, scoring, table
 from benchmarks.fidelity.case import Case
-from benchmarks.fidelity.faults.kinds import load_controls
 from benchmarks.fidelity.faults.runner import (
     Bench,
     Job,
     Outcome,
-    is_ranked,
     judge_outcomes,
-    list_jobs,
     run_control,
     run_jobs,
     without_figures,
@@ -124,51 +121,6 @@ def test_reasons_are_compared_without_their_figures() -> None:
     assert without_figures(["category F2D is 61.2, below 70"]) != without_figures(["category F3D is 61.2, below 70"])
 
 
-def test_the_sweep_has_its_runs_and_moves_scores_by_the_closed_form() -> None:
-    rows = scoring.sweep_thresholds({"base": values(0.95), "null": values(0.5), "ceiling": values(1.0)})
-    assert [sum(row["kind"] == kind for row in rows) for kind in ("common", "category", "independent")] == [2, 36, 128]
-    looser, tighter = (next(r for r in rows if r["run"] == name) for name in ("x1.1", "x0.9"))
-    assert looser["delta"] > 0.0 > tighter["delta"]
-    assert all(row["order_kept"] for row in rows)
-    summary = scoring.summarise(rows)
-    assert summary["independent"]["most"] - summary["independent"]["least"] < looser["delta"] - tighter["delta"]
-
-
-def test_seeds_that_move_one_category_up_and_another_down_are_beyond_the_limit_of_the_sweep() -> None:
-    def seeds(move: float) -> list[Values]:
-        return [values(0.95 + sign * move, ("TRK",), 0.95 - sign * 17 * move) for sign in (-1, 0, 1)]
-
-    for move, within in ((0.0005, True), (0.0025, False)):
-        runs = {str(seed): made for seed, made in enumerate(seeds(move))}
-        found = scoring.summarise(scoring.compare_seeds(runs, values(0.95)))["seed"]
-        assert found["sd"] < scoring.SEED_LIMIT
-        assert found["within"] is within
-
-
-def test_the_order_is_lost_where_the_null_tube_overtakes() -> None:
-    rows = scoring.sweep_thresholds({"base": values(0.5), "null": values(0.9)})
-    assert not any(row["order_kept"] for row in rows)
-
-
-def test_the_order_of_every_candidate_counts(monkeypatch: pytest.MonkeyPatch) -> None:
-    made = {"base": values(0.95), "null": values(0.5), "N02-2": values(0.7), "N25-30": values(0.6)}
-    rows = scoring.sweep_thresholds(made)
-    assert {row["lower"] for row in rows} == {3}
-    assert all(row["order_kept"] and row["tau"] == pytest.approx(1.0) for row in rows)
-    assert scoring.summarise(rows)["common"]["lower"] == 3
-    maps = {id: replace(row.map, good=row.map.bad, bad=row.map.good) for id, row in table.load().items()}
-    monkeypatch.setattr(scoring, "threshold_maps", lambda: iter([("common", "turned round", maps)]))
-    (turned,) = scoring.sweep_thresholds(made)
-    assert not turned["order_kept"]
-    assert turned["tau"] < 0.0
-
-
-def test_invariances_and_cheats_have_no_place_in_the_order() -> None:
-    ranked = [job for job in list_jobs() if is_ranked(job)]
-    quiet = [id for id, control in load_controls().items() if control.kind == "invariance"]
-    assert {job.control for job in list_jobs()} - {job.control for job in ranked} == {*quiet, "N35", "N36"}
-
-
 def test_without_any_reference_nothing_is_asked_over_the_null_tube() -> None:
     entries = table.load()
     alone = {id: v if set(entries[id].evidence) <= set("SK") else missing("none") for id, v in values(0.98).items()}
@@ -184,9 +136,7 @@ def test_all_forms_are_written_and_agree(tmp_path: Path) -> None:
     }
     controls = judge_outcomes([outcome("N24", 1.445, values(0.98, ("TRK",), 0.3))], base())
     judgement = judge.make_judgement(made, [], controls)
-    swept = {"rows": scoring.sweep_thresholds(made), "summary": {}}
-    swept["summary"] = scoring.summarise(swept["rows"])
-    write_report(tmp_path, case, Inputs(out=tmp_path), judgement, controls, swept)
+    write_report(tmp_path, case, Inputs(out=tmp_path), judgement, controls)
     content = json.loads((tmp_path / "report.json").read_text())
     with (tmp_path / "metrics.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
@@ -210,7 +160,7 @@ def test_a_figure_that_cannot_be_drawn_costs_no_other(
     monkeypatch.setattr(figures, "FIGURES", (("F00-broken", broken, None), ("F13", draw_categories, None)))
     case = replace(tube.case(), hold=None, truth=None, cache={})
     judgement = judge.make_judgement({"base": values(0.98), "null": values(0.7)}, [])
-    write_report(tmp_path, case, Inputs(), judgement, None, None)
+    write_report(tmp_path, case, Inputs(), judgement, None)
     assert "F00-broken is left out: too little of the section" in capsys.readouterr().out
     assert {path.name for path in (tmp_path / "figures").iterdir()} == {"F13.png", "F13.svg"}
 
@@ -219,7 +169,7 @@ def test_the_same_values_write_the_same_bytes(tmp_path: Path) -> None:
     case = replace(tube.case(), hold=None, truth=None, cache={})
     judgement = judge.make_judgement({"base": values(0.98), "null": values(0.7)}, [])
     for name in ("one", "other"):
-        write_report(tmp_path / name, case, Inputs(), judgement, None, None)
+        write_report(tmp_path / name, case, Inputs(), judgement, None)
     for file in ("report.json", "metrics.csv", "report.html", "figures/categories.svg"):
         assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "other" / file).read_bytes()
 
