@@ -28,7 +28,7 @@ AGAIN := out/reproduce
 reproduce: $(STAMP)  ## speed, dirty clouds and cells of the board again, on a CPU in about 25 minutes; says what differs from the records
 	$(BIN)/python -m benchmarks.throughput --n 1 1024 --peers none --poses 200000 --out $(AGAIN)/speed
 	test ! -e $(SHARED)/data/dirty_clouds || $(BIN)/python -m benchmarks.dirty $(SHARED)/data/dirty_clouds --out $(AGAIN)/dirty
-	-$(BIN)/python -m benchmarks.board.again --agents dead-reckoning fused scan-matching --out $(AGAIN)/board
+	-$(BIN)/python -m benchmarks.board --again 20 --agents dead-reckoning fused scan-matching --out $(AGAIN)/board
 	$(BIN)/python -m benchmarks.records compare $(AGAIN)/*/records.json
 
 arena: $(STAMP)    ## recordings for LiDAR-inertial programs into out/arena, 8 to 10 minutes and 2.2 GB; goes on where it stopped

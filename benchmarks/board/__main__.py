@@ -4,25 +4,42 @@
 
 Each task and agent is one file under `--out`/cells; a cell that is there is not driven again. `board.md` holds the
 tables, `board.png` the picture, `cells.jsonl` all cells. `--report-only` writes them of the cells that are there, or of
-those in a file `--cells`: `benchmarks/board/cells.jsonl` holds those on record.
+those in a file `--cells`: `benchmarks/board/cells.jsonl` holds those on record. `--again 20` drives so many episodes of
+each cell on record, or of `--cells`, once more and says whether agents, tasks and tunnels are still those that were
+scored.
 """
 
 import json
 import sys
+from pathlib import Path
 
 from benchmarks.board import tables
 from benchmarks.board.cells import Cell, Cells, Score, keys_of, over_split, read_cells, setting_of
 from benchmarks.board.columns import OWN, Setting
-from benchmarks.board.drive import BoardConfig, check, choose_by_rule, conditions_of_parts, drive, is_there, jobs_of
-from benchmarks.command import run_main
-from benchmarks.records import Record, of_facts, write_records
-from benchmarks.results import png_bytes, write_file
+from benchmarks.board.drive import (
+    BoardConfig,
+    check,
+    choose_by_rule,
+    compare,
+    conditions_of_parts,
+    drive,
+    is_there,
+    jobs_of,
+)
+from benchmarks.command import BenchmarkError, run_main
+from benchmarks.records import Record, measured, of_facts, write_records
+from benchmarks.results import environment_facts, png_bytes, write_file
 from subterra_jax.host.files import require_folder
 from subterra_jax.host.loading import load_file
 
+ON_RECORD = Path(__file__).parent / "cells.jsonl"
 
-def run(config: BoardConfig) -> None:
+
+def run(config: BoardConfig) -> int:
     """Drives the agents whose cells are missing, and writes tables, picture and records.
+
+    Returns:
+        1 where a cell driven again is another one, else 0.
 
     Raises:
         SubterraError: A task, split or agent is unknown, or the folder cannot be written.
@@ -30,6 +47,8 @@ def run(config: BoardConfig) -> None:
     for file in config.load:
         load_file(file)
     check(config)
+    if config.again:
+        return drive_again(config)
     jobs = jobs_of(config)
     require_folder(config.out)
     missing = [job for job in jobs if not is_there(config, job)]
@@ -43,6 +62,36 @@ def run(config: BoardConfig) -> None:
     if table := tables.screen_markdown(cells):
         print(table)
     print(config.out / "board.md")
+    return 0
+
+
+def drive_again(config: BoardConfig) -> int:
+    """Drives some episodes of cells on record, writes `again.json` and a record; returns 1 where a cell is another one.
+
+    Raises:
+        BenchmarkError: No cell of these tasks and agents is on record.
+    """
+    source = config.cells or ON_RECORD
+    settings, agents = {job.setting for job in jobs_of(config)}, config.agents
+    cells = [cell for cell in read_cells(source, conditions_of_parts(config))
+             if setting_of(cell) in settings and (not agents or cell["agent"] in agents)]  # fmt: skip
+    if not cells:
+        raise BenchmarkError(f"{source}: holds no cell of these tasks and agents")
+    require_folder(config.out)
+    found = []
+    for cell in cells:
+        row = compare(cell, config)
+        found.append(row)
+        print(
+            f"{row['task']}, {row['agent']}: {row['differ']} of {row['episodes']} differ", file=sys.stderr, flush=True
+        )
+        content = {"facts": environment_facts(), "cells": found}
+        write_file(config.out / "again.json", (json.dumps(content) + "\n").encode())
+    same = sum(not row["differ"] for row in found)
+    command, share = f"benchmarks.board --again {config.again} --out out/again", round(100.0 * same / len(found), 1)
+    write_records(config.out / "records.json", [measured("board/again/same", share, "%", command, n=len(found))])
+    print(f"{same} of {len(found)} cells have the same successes and contacts in {config.again} episodes")
+    return int(same < len(found))
 
 
 def records_of(cells: Cells) -> list[Record]:

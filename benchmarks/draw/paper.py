@@ -1,4 +1,4 @@
-"""The paper's figures: recording beside bore (1), pipeline (2), occupancy (3), learning curves (4).
+"""The paper's figures: recording beside bore (1), occupancy (3), learning curves (4).
 
 `python -m benchmarks.draw paper --survey build/survey --scene build/tunnel --out out/figures`; `make figures` makes
 survey, scene and runs as well.
@@ -16,19 +16,16 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from matplotlib.patches import FancyArrowPatch
 from scipy.ndimage import minimum_filter1d
 
 from benchmarks.command import BenchmarkError, run_main
 from benchmarks.draw.scene import Picture, Pose, picture
 from benchmarks.fidelity.candidate import load_candidate
 from benchmarks.fidelity.case import Case
-from benchmarks.fidelity.derive.beams import cast_beams
 from benchmarks.fidelity.derive.surface import surface_caster
 from benchmarks.fidelity.references import HoldConfig, load_hold
-from benchmarks.fidelity.report.figures import BLUE, GREY, INK, Sheet, draw_mismatch, draw_projections
+from benchmarks.fidelity.report.figures import Sheet, draw_mismatch, draw_projections
 from benchmarks.results import write_file
-from benchmarks.truth import scene_points
 from scene.poses.trajectory import Trajectory, load_tum
 from scene.reading.recording import Recording
 from scene.reading.times import Scan
@@ -56,7 +53,7 @@ _LARGEST = 9  # pixels across a drawn return, at most
 class PaperConfig:
     """Draws the paper's figures as PDF and PNG, with captions and numbers in `figures.json`."""
 
-    survey: Path | None = None  # Folder of a simulated survey with the sensors Avia and OS1, for figures 1 to 3.
+    survey: Path | None = None  # Folder of a simulated survey with the sensors Avia and OS1, for figures 1 and 3.
     scene: Path | None = None  # Scene folder built from its `survey.bag`; the OS1 is held out.
     runs: Path | None = None  # Folder with run folders `seed-*` of `train`, for figure 4.
     out: Path = Path("out/figures")  # Output folder.
@@ -78,7 +75,6 @@ class Frame:
     position: Float[np.ndarray, "3"]  # LiDAR position in the middle of that time, m
     origin: Float[np.ndarray, "n 3"]  # LiDAR position at each return, m
     points: Float[np.ndarray, "n 3"]  # Returns, m
-    single: slice  # Rows of the scan in the middle
     topic: str  # Topic of the recording
     duration: float  # Length of the frame, s
 
@@ -118,11 +114,8 @@ def load_frame(
         position, rotation = poses.at(scan.stamp + scan.times)
         sensor.append(position - origin)
         points.append(position - origin + rotation.apply(scan.points))
-    half = len(taken) // 2
-    first = sum(len(scan.times) for scan in taken[:half])
     here = poses.at(np.array([middle]))[0][0] - origin
-    single = slice(first, first + len(taken[half].times))
-    return Frame(here, np.concatenate(sensor), np.concatenate(points), single, topic, duration)
+    return Frame(here, np.concatenate(sensor), np.concatenate(points), topic, duration)
 
 
 def _best_time(
@@ -160,12 +153,6 @@ class Material:
         return Case(candidate, load_hold(bag, poses, candidate.origin, HoldConfig(scan_spacing=0.5, sigma=0.03)))
 
     @cached_property
-    def residual(self) -> Float[np.ndarray, " k"]:
-        """Range in the scene less held-out range of every held-out beam that meets the scene, m."""
-        pairs = cast_beams(self.case)
-        return pairs.difference[pairs.hit]
-
-    @cached_property
     def row(self) -> int:
         """Index of the bore's section where the frame is taken."""
         return round(_FRAME_SHARE * (len(self.case.candidate.bore.station) - 1))
@@ -190,11 +177,6 @@ class Material:
     def view(self) -> Picture:
         """Scene rendered by MuJoCo from that pose."""
         return picture(self.scene, self.pose)
-
-    @cached_property
-    def cloud(self) -> Float[np.ndarray, "p 3"]:
-        """Registered cloud, thinned, tunnel frame, m."""
-        return scene_points(self.scene)
 
 
 Drawn = tuple[Figure, str]
@@ -254,97 +236,12 @@ def in_camera(pose: Pose, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray,
     return local[(np.abs(local[:, :2] / local[:, 2:]) <= half).all(axis=1)]
 
 
-_SLICE = 0.15  # m either side of a section
-_HISTOGRAM = 10.0  # cm, largest error in the histogram
-_STRETCH, _WALL, _KNEE = 4.0, 0.25, -1.3  # m of the view from above: either side, left out beside walls, height limit
-_TOP, _BOTTOM, _GAP, _EDGE = 0.87, 0.32, 0.033, 0.008  # shares of the figure
-
-
-def draw_pipeline(material: Material) -> Drawn:
-    """Draws figure 2: five stages from the recording to the validated scene, with arrows between them."""
-    facts, bore, count = (material.manifest[name] for name in ("detected", "bore", "count"))
-    error = 100.0 * np.abs(material.residual)
-    size = f"{bore['width_mean']:.2f} $\\times$ {bore['height_mean']:.2f} m"
-    track = f"{count['pockets']:,} pockets, {count['sleepers']:,} sleepers"
-    stages: tuple[tuple[str, Callable[[Material, Any], None], list[str]], ...] = (
-        ("recording", _scan, [f"{facts['scans']:,} scans", f"{facts['returns'] / 1e6:.1f} M returns"]),
-        ("cloud", _plan, [f"{facts['points'] / 1e6:.2f} M voxels", f"by {facts['length_fixed_by']}"]),
-        ("bore", _section, [f"{bore['length']:.1f} m", size]),
-        ("MuJoCo scene", _view, [f"{count['lining_faces'] / 1e3:.0f} k faces", track]),
-        ("held-out LiDAR", _errors, [f"median {np.median(error):.1f} cm",
-                                     f"{100 * np.mean(error < _HISTOGRAM):.1f} % in 10 cm"]),
-    )  # fmt: skip
-    figure = plt.figure(figsize=(_PAGE, 1.6))
-    width = (1.0 - 2 * _EDGE - (len(stages) - 1) * _GAP) / len(stages)
-    for k, (title, paint, lines) in enumerate(stages):
-        left = _EDGE + k * (width + _GAP)
-        axes = figure.add_axes((left, _BOTTOM, width, _TOP - _BOTTOM))
-        paint(material, axes)
-        axes.set(xticks=[], yticks=[])
-        figure.text(left + 0.5 * width, _TOP + 0.03, title, ha="center", va="bottom", weight="bold", fontsize=7.5)
-        figure.text(left + 0.5 * width, _BOTTOM - 0.03, "\n".join(lines), ha="center", va="top", fontsize=6.5)
-        if k:
-            ends = ((left - _GAP, 0.5 * (_TOP + _BOTTOM)), (left, 0.5 * (_TOP + _BOTTOM)))
-            figure.add_artist(FancyArrowPatch(*ends, transform=figure.transFigure, arrowstyle="-|>",
-                                              mutation_scale=8, color=INK, lw=0.9))  # fmt: skip
-    return (
-        figure,
-        "From the recording to the scene; the last stage compares it with a LiDAR that the builder never read.",
-    )
-
-
-def _scan(material: Material, axes: Any) -> None:
-    """Draws one raw scan from the side."""
-    frame, pose = material.frame, material.pose
-    local = (frame.points[frame.single] - pose.position) @ pose.axes.T
-    local = local[local[:, 2] < 30.0]
-    axes.scatter(local[:, 2], local[:, 1], c=local[:, 2], cmap="viridis_r", s=0.4, lw=0.0, rasterized=True)
-    axes.set(xlim=(-1.0, 30.0), ylim=(-8.0, 10.0))
-
-
-def _plan(material: Material, axes: Any) -> None:
-    """Draws the cloud of floor and track from above, coloured by height."""
-    bore, row = material.case.candidate.bore, material.row
-    offset = material.cloud - bore.position[row]
-    along, left, up = (offset @ axis[row] for axis in (bore.tangent, bore.lateral, bore.up))
-    shown = (np.abs(along) < _STRETCH) & (np.abs(left) < 0.5 * bore.width[row] - _WALL) & (up < _KNEE)
-    along, left, up = (values[shown][np.argsort(up[shown])] for values in (along, left, up))
-    low, high = np.percentile(up, (1, 99))
-    axes.scatter(along, left, c=up, cmap="cividis", s=0.8, lw=0.0, vmin=low, vmax=high, rasterized=True)
-    axes.set_aspect("equal", adjustable="datalim")
-
-
-def _section(material: Material, axes: Any) -> None:
-    """Draws the section at the frame's place over the cloud around it."""
-    bore, row = material.case.candidate.bore, material.row
-    offset = material.cloud - bore.position[row]
-    near = offset[np.abs(offset @ bore.tangent[row]) < _SLICE]
-    near = near[np.linalg.norm(near, axis=1) < 2.0 * bore.radius[row].max()]
-    axes.plot(near @ -bore.lateral[row], near @ bore.up[row], ".", ms=0.8, color=GREY, rasterized=True)
-    angle, radius = np.append(bore.angle, bore.angle[0]), np.append(bore.radius[row], bore.radius[row][0])
-    axes.plot(-radius * np.cos(angle), radius * np.sin(angle), color=BLUE, lw=1.0)
-    axes.set_aspect("equal", adjustable="datalim")
-
-
-def _view(material: Material, axes: Any) -> None:
-    axes.imshow(material.view, aspect="auto")
-
-
-def _errors(material: Material, axes: Any) -> None:
-    """Draws the histogram of ranges in the scene less those of the held-out LiDAR, cm."""
-    axes.hist(100.0 * material.residual, np.linspace(-_HISTOGRAM, _HISTOGRAM, 41), color=BLUE)
-    axes.axvline(0.0, color=INK, lw=0.6)
-    axes.set_xlim(-_HISTOGRAM, _HISTOGRAM)
-    axes.set_title("from $-$10 to 10 cm", fontsize=5.5, y=0.85)
-
-
 def _drawings(material: Material) -> dict[str, Callable[[], Drawn | None]]:
-    """Returns what draws figures 1 to 3 by name; the third is that of a fidelity report."""
+    """Returns what draws figures 1 and 3 by name; the third is that of a fidelity report."""
     report = {"seed": 0, "split": {"hold": {"file": SURVEY_FILES[2]}, "rule": "by sensor"}}
     sheet = Sheet(material.case, report)
     return {
         "fig1": lambda: draw_bore_view(material),
-        "fig2": lambda: draw_pipeline(material),
         "fig3a": lambda: draw_projections(sheet),
         "fig3b": lambda: draw_mismatch(sheet),
     }
@@ -357,7 +254,7 @@ def run(config: PaperConfig) -> None:
         SubterraError: An input is missing or broken, or the folder cannot be written.
     """
     if config.runs is None and (config.survey is None or config.scene is None):
-        raise BenchmarkError("figures 1 to 3 need --survey and --scene, figure 4 needs --runs")
+        raise BenchmarkError("figures 1 and 3 need --survey and --scene, figure 4 needs --runs")
     for folder, files in ((config.survey, SURVEY_FILES), (config.scene, SCENE_FILES)):
         missing = [folder / file for file in files if not (folder / file).exists()] if folder is not None else []
         if missing:

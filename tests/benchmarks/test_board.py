@@ -7,7 +7,7 @@ import pytest
 
 import subterra_jax as st
 from benchmarks.board import __main__ as command
-from benchmarks.board import again, cells, columns, drive, roster, tables
+from benchmarks.board import cells, columns, drive, roster, tables
 from benchmarks.board.__main__ import records_of
 from benchmarks.board.columns import OWN, Column, Setting
 from benchmarks.board.drive import BoardConfig, Job
@@ -164,8 +164,8 @@ def test_conditions_of_parts_are_those_of_every_choice_of_splits_and_sensors(tmp
 
 
 def test_all_cells_on_record_are_of_todays_constants():
-    kept = cells.read_cells(again.ON_RECORD, drive.conditions_of_parts(BoardConfig(again.ON_RECORD)))
-    assert len(kept) == len(again.ON_RECORD.read_text().splitlines())
+    kept = cells.read_cells(command.ON_RECORD, drive.conditions_of_parts(BoardConfig(command.ON_RECORD)))
+    assert len(kept) == len(command.ON_RECORD.read_text().splitlines())
     assert cells.find_leaks(kept) == []
 
 
@@ -229,11 +229,12 @@ def test_what_is_driven_in_parts_and_again_is_the_same(tmp_path, monkeypatch):
     for name in ("success", "contact", "floor"):
         assert whole[name] == some[name], name
     np.testing.assert_allclose(whole["goal_error"], some["goal_error"], atol=0.002)
-    row = again.compare(whole, again.AgainConfig(tmp_path, episodes=4))
-    assert row["same"]
+    again = BoardConfig(tmp_path, again=4)
+    row = drive.compare(whole, again)
+    assert row["differ"] == 0
     assert row["apart"] < 0.002
     whole["success"] = [1 - hit for hit in whole["success"]]
-    row = again.compare(whole, again.AgainConfig(tmp_path, episodes=4))
+    row = drive.compare(whole, again)
     assert row["differ"] == row["episodes"] == 4
 
 
