@@ -78,8 +78,7 @@ def run_and_report(config: ThroughputConfig) -> int:
     except FloatingPointError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
-    # In a file or a pipe tables are not wrapped; a terminal knows its own width.
-    report.show(result, Console(highlight=False, emoji=False, width=None if sys.stdout.isatty() else 120))
+    print(report.as_text(result))
     if config.out is not None:
         write_file(config.out / "throughput.json", report.as_json(result).encode())
         write_records(config.out / "records.json", report.records_of(result))

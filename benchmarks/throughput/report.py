@@ -1,16 +1,13 @@
-"""One run's results: tables on a terminal, `throughput.json`, and records."""
+"""One run's results: a table, `throughput.json`, and records."""
 
 import dataclasses
 import json
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
-from rich.console import Console
-from rich.table import Table
-
 from benchmarks.records import Record, measured
 from benchmarks.reference import Agreement
+from benchmarks.results import markdown_table
 from benchmarks.throughput.config import ThroughputConfig
 from benchmarks.throughput.loops import N_BEAMS, Peer
 from benchmarks.throughput.timing import Speed
@@ -65,72 +62,32 @@ def _peer(peer: Peer, result: Result) -> dict[str, Any]:
     }
 
 
-def show(result: Result, console: Console) -> None:
-    """Prints speeds, ratios and the comparison with the reference."""
-    facts = result.environment
-    console.print(
-        f"{facts['device']}, {facts['cpu_cores']} cores, jax {facts['jax']}, {facts['date']}; "
-        f"{result.config.task} in {result.tunnel['name']}, {result.tunnel['lining']}",
-        highlight=False,
-    )
-    console.print(_speeds(result))
-    for peer in result.peers:
-        for size, reason in peer.left_out.items():
-            console.print(f"{peer.name}, {size}: {reason}", highlight=False)
-        if peer.speeds:
-            console.print(f"{peer.name} {peer.version}: {peer.about}", highlight=False)
-    if any(peer.speeds for peer in result.peers):
-        console.print(_ratios(result))
-    if result.exactness is not None:
-        console.print(gate_line(result.exactness), highlight=False)
-
-
-def gate_line(gate: Agreement) -> str:
-    """Returns the comparison with the reference in one line."""
-    return (
-        f"LiDAR against float64 brute force, {gate.n_rays:,} rays: largest error {gate.max_error * 1e3:.3f} mm, "
-        f"{gate.n_ambiguous} at an edge within rounding, {gate.n_wrong} wrong"
-    )
-
-
-def _speeds(result: Result) -> Table:
-    table = _table(
-        "environment steps", ("who", "envs", "median /s", "quartiles", "ns per step", "rays /s", "compile, s")
-    )
-    sources: list[tuple[str, int, Iterable[Speed]]] = [("subterra", result.n_beams, result.speeds)]
-    sources += [(peer.name, N_BEAMS, peer.speeds) for peer in result.peers]
-    for name, n_beams, speeds in sources:
+def as_text(result: Result) -> str:
+    """Returns speeds, ratios and the comparison with the reference as lines and Markdown tables."""
+    facts, config = result.environment, result.config
+    who = [("subterra", result.n_beams, result.speeds), *((peer.name, N_BEAMS, peer.speeds) for peer in result.peers)]
+    rows = []
+    for name, n_beams, speeds in who:
         for speed in speeds:
-            _, median, _ = speed.quartiles
-            rays = format_rate(n_beams * median)
-            table.add_row(
-                name, f"{speed.n_envs:,}", format_rate(median), _quartiles(speed), f"{1e9 / median:,.1f}", rays,
-                f"{speed.compile_seconds:.1f}",
-            )  # fmt: skip
-        table.add_section()
-    return table
-
-
-def _ratios(result: Result) -> Table:
-    peers = [peer for peer in result.peers if peer.speeds]
-    table = _table("times as fast as", ("envs", *(peer.name for peer in peers)))
-    ratios = [result.ratios(peer) for peer in peers]
-    for speed in result.speeds:
-        cells = [f"{each[speed.n_envs]:,.3g}" if speed.n_envs in each else "-" for each in ratios]
-        table.add_row(f"{speed.n_envs:,}", *cells)
-    return table
-
-
-def _table(title: str, names: tuple[str, ...]) -> Table:
-    table = Table(title=title)
-    for name in names:
-        table.add_column(name, justify="left" if name == "who" else "right", no_wrap=name != title)
-    return table
-
-
-def _quartiles(speed: Speed) -> str:
-    lower, _, upper = speed.quartiles
-    return f"{format_rate(lower)} to {format_rate(upper)}"
+            lower, median, upper = map(format_rate, speed.quartiles)
+            per_step, rays = 1e9 / speed.quartiles[1], format_rate(n_beams * speed.quartiles[1])
+            rows.append((name, f"{speed.n_envs:,}", median, f"{lower} to {upper}", f"{per_step:,.1f}", rays,
+                         f"{speed.compile_seconds:.1f}"))  # fmt: skip
+    lines = [
+        f"{facts['device']}, {facts['cpu_cores']} cores, jax {facts['jax']}, {facts['date']}; "
+        f"{config.task} in {result.tunnel['name']}, {result.tunnel['lining']}",
+        markdown_table(("who", "envs", "median /s", "quartiles", "ns per step", "rays /s", "compile, s"), rows),
+    ]
+    for peer in result.peers:
+        lines += [f"{peer.name}, {size}: {reason}" for size, reason in peer.left_out.items()]
+        times = [f"{ratio:,.3g} at {n_envs:,}" for n_envs, ratio in result.ratios(peer).items()]
+        lines += [f"{peer.name} {peer.version}: {peer.about}; times as fast: {', '.join(times)}"] if times else []
+    if (gate := result.exactness) is not None:
+        lines.append(
+            f"LiDAR against float64 brute force, {gate.n_rays:,} rays: largest error {gate.max_error * 1e3:.3f} mm, "
+            f"{gate.n_ambiguous} at an edge within rounding, {gate.n_wrong} wrong"
+        )
+    return "\n".join(lines)
 
 
 def format_rate(value: float) -> str:
