@@ -303,14 +303,6 @@ def test_a_branch_or_a_room_is_refused_with_its_place_in_the_frame_of_the_input(
     assert np.linalg.norm(np.array([float(value) for value in told.groups()]) - there) < (18.0 if name == "Y" else 8.0)
 
 
-def test_a_tunnel_that_ends_in_a_crossing_one_is_refused_at_its_end():
-    with pytest.raises(FitError) as raised:
-        cleaned(cavity(LONG, Tube((50, -20), (50, 20))), strict=True)
-    assert raised.value.code == Refusal.BRANCH
-    x = float(re.search(r"near \((\S+),", str(raised.value)).group(1))
-    assert abs(x - PLACE[0] - 50) < 8.0
-
-
 @pytest.mark.parametrize(("yaw", "tilt"), ORIENTATIONS[1:])
 def test_a_niche_and_a_passage_are_cut_off(yaw, tilt):
     niche, door = Box((20, 0), (23, 4.5), 2.5), Tube((35, 0), (35, 8), 1.8, 2.2)

@@ -36,15 +36,6 @@ def test_what_was_removed_is_listed_by_stretch_with_its_place_in_the_frame_of_th
     np.testing.assert_allclose(removed[-1].place, there, atol=1e-3)
 
 
-def test_stations_of_what_was_removed_follow_the_axis():
-    cloud = thin(curved_d_bore(length=20).points)
-    cause = np.zeros(len(cloud.points), np.int8)
-    cause[:10] = Cause.INSIDE
-    (part,) = list_removed(cloud, cause, np.full(len(cause), 4.0), gap=1.0)
-    assert (part.shifted(-1.5).start, part.shifted(-1.5).end) == (2.5, 2.5)
-    assert (part.reversed(20.0).start, part.reversed(20.0).end) == (16.0, 16.0)
-
-
 def test_a_branch_that_runs_on_beside_the_bore_is_named_where_it_meets_it():
     """Another bore 14 m behind the wall over 50 m, joined by a passage of 3 m."""
     random = np.random.default_rng(1)

@@ -100,30 +100,6 @@ def test_delimiter_header_and_decimal_comma_are_detected(tmp_path, delimiter, he
     np.testing.assert_allclose(points_of(path)[0], ordered(POINTS), atol=2e-6)
 
 
-def test_columns_are_found_by_name_in_any_order(tmp_path):
-    path = write_text(tmp_path / "a.csv", POINTS[:, [2, 0, 1]], ",", "z,x,y")
-    np.testing.assert_allclose(points_of(path)[0], ordered(POINTS), atol=2e-6)
-    path = write_text(tmp_path / "a.csv", POINTS[:, [1, 0, 2]], ",", "Northing,Easting,Elevation")
-    np.testing.assert_allclose(points_of(path)[0], ordered(POINTS), atol=2e-6)
-
-
-def test_names_give_their_unit():
-    assert plain_name("EASTING (M.)") == ("easting", "m")
-    assert plain_name("//X [mm]") == ("x", "mm")
-    assert plain_name("z_mm") == ("z", "mm")
-    assert plain_name("m") == ("m", None)
-    assert find_xyz(["t", "x (mm)", "y (mm)", "z (mm)"]) == ([1, 2, 3], "mm")
-    with pytest.raises(ValueError, match="differ in unit"):
-        find_xyz(["x (mm)", "y (m)", "z (mm)"])
-
-
-@pytest.mark.parametrize("name", [name for name in CLOUDS if "e57" not in name and "la" not in name])
-def test_millimetres_are_detected_and_become_metres(tmp_path, name):
-    back, facts = points_of(CLOUDS[name](tmp_path / name, POINTS * 1000))
-    np.testing.assert_allclose(back, ordered(POINTS), atol=2e-4)
-    assert facts["unit"].startswith("mm (detected")
-
-
 def test_a_flag_comes_before_a_declaration_and_a_declaration_before_detection(tmp_path):
     path = write_text(tmp_path / "a.csv", POINTS, ",", "x (mm),y (mm),z (mm)")
     assert points_of(path)[1]["unit"] == "mm (declared)"
@@ -143,11 +119,6 @@ def test_a_cloud_that_lies_along_z_is_turned_and_says_so():
     assert "y is taken as up" in frame.facts["axes"]
     np.testing.assert_allclose(frame.apply(along_z), np.column_stack([POINTS[:, 1], -POINTS[:, 0], POINTS[:, 2]]))
     assert choose_frame(along_z, None, None, "xyz").facts["axes"] == "xyz (by flag)"
-
-
-def test_a_long_climbing_tunnel_in_metres_is_not_taken_for_millimetres():
-    climb = np.random.default_rng(0).uniform(0, 1, (500, 1)) * [5000, 3000, 150] + POINTS
-    assert choose_frame(climb, None, None, None).unit == "m"
 
 
 @pytest.mark.parametrize(
@@ -293,16 +264,16 @@ def test_other_units_are_refused_by_name_unless_a_flag_overrides(tmp_path, name)
 @pytest.mark.parametrize(
     ("text", "base", "unit"),
     [("EASTING (FT.)", "easting", "ft"), ("x [feet]", "x", "ft"), ("y_ft", "y", "ft"), ("Z (US FT)", "z", "us-ft"),
-     ("Z (usft)", "z", "us-ft"), ("x_m", "x", "m"), ("foot", "foot", None)],
+     ("Z (usft)", "z", "us-ft"), ("x_m", "x", "m"), ("foot", "foot", None), ("EASTING (M.)", "easting", "m"),
+     ("//X [mm]", "x", "mm"), ("m", "m", None)],
 )  # fmt: skip
-def test_headers_in_feet_are_understood(text, base, unit):
+def test_names_of_columns_give_their_unit(text, base, unit):
     assert plain_name(text) == (base, unit)
 
 
-def test_a_table_whose_header_says_feet_is_read_in_feet(tmp_path):
-    cloud, facts = read_cloud(write_text(tmp_path / "a.csv", BOX, ",", "X (ft),Y (ft),Z (ft)"), 1e-4)
-    assert facts["unit"] == "ft (declared)"
-    np.testing.assert_allclose(np.ptp(cloud.points, axis=0), np.ptp(BOX, axis=0) * 0.3048, atol=1e-3)
+def test_columns_that_differ_in_unit_are_refused():
+    with pytest.raises(ValueError, match="differ in unit"):
+        find_xyz(["x (mm)", "y (m)", "z (mm)"])
 
 
 def test_coordinates_rounded_to_centimetres_are_told_and_those_rounded_to_half_a_metre_refused(tmp_path):

@@ -14,7 +14,7 @@ from scene.errors import RecordingError
 from scene.judging.codes import Code
 from scene.judging.judge import Warned
 from scene.reading.cloudfile import read_cloud
-from scene.reading.formats import ReadingConfig, describe, detect, left_out
+from scene.reading.formats import ReadingConfig, detect
 from scene.reading.recording import Recording
 from scene.writing.folder import SCENES, state_crs
 from tests.scene.bags import write_bag
@@ -178,12 +178,6 @@ def test_two_lidars_in_one_bag_are_asked_for(tmp_path):
         Recording(bag)
     with Recording(bag, topic="/lidar_rear/points") as recording:
         assert recording.topic == "/lidar_rear/points"
-
-
-def test_what_was_left_out_is_said(tmp_path):
-    las = write_las(tmp_path / "a.las", XYZ, withheld=range(30), noise=(40, 41))
-    assert "left out: 30 points (withheld), 2 points (noise)" in describe({"kind": "cloud", **read_cloud(las, 0.01)[1]})
-    assert left_out({"points_without_time": 5, "scans_without_pose": 0}) == "5 points without a time of their sweep"
 
 
 def test_both_scenes_hold_the_crs_of_their_input(tmp_path):

@@ -96,6 +96,7 @@ HEADERS = {
     "Este;Norte;Cota": (0, 1, 2),
     "Est;Nord;Altitude": (0, 1, 2),
     "Northing;Easting;RL": (1, 0, 2),
+    "z;x;y": (1, 2, 0),
 }
 
 

@@ -193,14 +193,6 @@ def test_a_tunnel_of_20_km_is_checked_in_a_moment():
 
 
 @pytest.mark.door
-def test_an_unknown_tunnel_is_told_those_there_are():
-    with pytest.raises(
-        st.TunnelError, match="subterra-352: no such tunnel file; by name there are subterra-351, metro"
-    ):
-        st.make("Subterra/Traverse-v1", tunnel="subterra-352")
-
-
-@pytest.mark.door
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [

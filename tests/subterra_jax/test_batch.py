@@ -40,16 +40,6 @@ def run(batch, params, n: int, steps: int, action=None):
     return obs, outs
 
 
-def test_what_an_environment_does_does_not_depend_on_the_size_of_the_batch():
-    batch, params = batch_of()
-    first, many = run(batch, params, N, 12)
-    few_first, few = run(batch, params, FEW, 12)
-    np.testing.assert_allclose(first[:FEW], few_first, atol=2e-4)
-    for (_, a), (_, b) in zip(many, few, strict=True):
-        for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
-            np.testing.assert_allclose(np.asarray(x)[:FEW], np.asarray(y), atol=2e-4)
-
-
 def test_a_batch_steps_like_its_environments_alone():
     batch, params = batch_of(horizon=1000)
     env = batch.env
@@ -103,13 +93,6 @@ def test_each_episode_of_one_environment_has_its_own_bias_and_start():
         assert len(np.unique(values)) == values.size
     starts = np.stack([np.asarray(state.lateral) for state in states])
     assert len(np.unique(starts)) == starts.size
-
-
-def test_within_an_episode_the_bias_does_not_change():
-    batch, params = batch_of()
-    _, outs = run(batch, params, FEW, 5, action=(1.0, 0.0))
-    biases = np.stack([np.asarray(after.odometry.distance_bias) for _, (_, after, *_) in outs])
-    assert (biases == biases[0]).all()
 
 
 def test_params_may_differ_from_environment_to_environment():

@@ -9,7 +9,6 @@ import subterra_jax as st
 from benchmarks import reference
 from subterra_jax.procedural import open_world
 from subterra_jax.tunnel import Tunnel, blocks, from_centreline
-from subterra_jax.tunnel.distances import distance_to_segment
 from subterra_jax.tunnel.order import order, windows
 
 
@@ -38,17 +37,6 @@ def test_a_box_encloses_its_piece_and_lies_along_a_nearly_straight_one():
     assert thickness.max() < 0.04
 
 
-def test_a_piece_is_boxed_as_it_is_alone_and_a_repeated_point_gets_a_box():
-    rng = np.random.default_rng(0)
-    pieces, count = np.cumsum(rng.normal(0.1, 0.2, (40, 6, 2)), axis=1), rng.integers(2, 7, 40)
-    pieces[7] = pieces[7, :1]
-    together = blocks.thin_boxes(pieces, count)
-    for i in range(40):
-        for many, one in zip(together, blocks.thin_boxes(pieces[i : i + 1], count[i : i + 1]), strict=True):
-            np.testing.assert_array_equal(many[i], one[0])
-    assert together[2][7] == pytest.approx(blocks.BOX_MARGIN, abs=1e-7)
-
-
 def test_a_pocket_gets_a_lid_and_a_deep_wide_niche_does_not():
     def wall(depth: float) -> np.ndarray:
         return np.array([[0.0, 0.0], [0.5, 0.0], [0.5, depth], [1.5, depth], [1.5, 0.0], [2.0, 0.0]])
@@ -57,11 +45,6 @@ def test_a_pocket_gets_a_lid_and_a_deep_wide_niche_does_not():
     hull, size = blocks.add_lids(pieces, np.full(3, 6), np.array([-1.0, -1.0, 0.0]))
     assert size.tolist() == [2, 6, 6]
     np.testing.assert_array_equal(hull[0, :2], [[0.0, 0.0], [2.0, 0.0]])
-
-
-def test_the_distance_to_a_segment_is_that_to_its_line_or_its_nearer_end():
-    point = np.array([[0.0, 2.0], [5.0, 4.0], [-4.0, 0.0]])
-    np.testing.assert_allclose(distance_to_segment(point, np.zeros(2), np.array([2.0, 0.0])), [2.0, 5.0, 2.0])
 
 
 def test_windows_hold_every_block_within_reach_found_one_by_one():

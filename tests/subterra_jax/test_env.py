@@ -1,7 +1,5 @@
 """The environment contract, over every task."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import jaxtyping
@@ -11,7 +9,6 @@ import pytest
 import subterra_jax as st
 from subterra_jax.lidar import LidarParams
 from subterra_jax.parts.obstacles import ObstacleParams
-from subterra_jax.parts.odometer import OdometryParams
 from subterra_jax.parts.unicycle import VehicleParams
 from subterra_jax.rules import StartParams
 
@@ -101,16 +98,6 @@ def test_every_leaf_of_the_params_is_a_strong_array_of_32_bits(task):
         assert not leaf.weak_type
 
 
-def test_a_step_compiles_once_whatever_the_values(task):
-    env, params, reset, _ = task
-    step = jax.jit(env.step)
-    _, state = reset(jax.random.key(0), params)
-    for k in range(3):
-        _, state, *_ = step(jax.random.key(k), state, 0.1 * k * forward(env), params)
-    step(jax.random.key(9), state, forward(env), dataclasses.replace(params, horizon=jnp.int32(7)))
-    assert step._cache_size() == 1
-
-
 def test_the_same_key_gives_the_same_result_and_another_key_another(task):
     env, params, reset, step = task
     _, state = reset(jax.random.key(0), params)
@@ -118,26 +105,6 @@ def test_the_same_key_gives_the_same_result_and_another_key_another(task):
     leaves_equal(once, again)
     a, b = (step(jax.random.key(k), state, forward(env), params)[0] for k in (3, 4))
     assert (a != b).any()
-
-
-def test_two_resets_differ_in_pose_and_in_odometry_bias(task):
-    _, params, reset, _ = task
-    states = [reset(jax.random.key(k), params)[1] for k in range(2)]
-    for name in ("lateral", "heading"):
-        assert getattr(states[0], name) != getattr(states[1], name)
-    assert states[0].odometry.distance_bias != states[1].odometry.distance_bias
-    assert states[0].odometry.heading_bias != states[1].odometry.heading_bias
-
-
-def test_episodes_start_at_the_mouth_within_their_bounds():
-    env, params = st.make("Subterra/TraverseShort-v1")
-    reset = jax.jit(jax.vmap(env.reset, (0, None)))
-    _, state = reset(jax.random.split(jax.random.key(0), 500), params)
-    assert (np.asarray(state.station) == 0.0).all()
-    assert 0.45 < np.abs(state.lateral).max() <= 0.5
-    tangent = np.asarray(params.tunnel.grid)[0, 2:4]
-    off_axis = np.asarray(state.heading) - np.arctan2(tangent[1], tangent[0])
-    assert 0.09 < np.abs(off_axis).max() <= 0.1 + 1e-6
 
 
 def test_vmap_equals_a_loop(task):
@@ -265,12 +232,6 @@ def test_a_ready_tunnel_is_taken_as_it_is_but_not_beyond_its_reach():
     assert float(params.tunnel.length) == pytest.approx(80.0)
     with pytest.raises(ValueError, match="ranges up to 30"):
         st.make("Subterra/TraverseShort-v1", tunnel=tunnel, lidar=LidarParams(range_max=50.0))
-
-
-def test_the_short_task_is_the_first_60_metres():
-    assert float(st.make("Subterra/TraverseShort-v1")[1].tunnel.length) == pytest.approx(60.0)
-    assert float(st.make("Subterra/TraverseShort-v1", odometry=OdometryParams())[1].horizon) == 600
-    assert float(st.make("Subterra/Traverse-v1")[1].horizon) == 3000
 
 
 @pytest.mark.door

@@ -142,17 +142,6 @@ def test_a_packed_block_holds_the_box_its_plane_and_its_vertices(name: str | Non
         assert np.all(wall[len(own) :] == wall[-1])
 
 
-def test_a_stack_is_packed_as_its_tunnels_are(plan: st.TunnelPlan) -> None:
-    one, other = Tunnel.from_plan(plan), Tunnel.from_plan(piece_of(NAMES[4]))
-    both = stack([one, other])
-    for tunnel, begin in ((one, 0), (other, int(both.visit_first[-1] - other.visit_first[-1]))):
-        own, theirs = both.packed.block[begin : begin + len(tunnel.packed.block)], tunnel.packed.block
-        np.testing.assert_array_equal(own[:, :6], theirs[:, :6])
-        shift = int(own[0, 6])
-        np.testing.assert_array_equal(own[:, 6] - shift, theirs[:, 6])
-        np.testing.assert_array_equal(both.packed.wall[shift : shift + len(tunnel.packed.wall)], tunnel.packed.wall)
-
-
 def places(plan: st.TunnelPlan, lining: str, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Positions (m) and stations (m): in the whole bore, about the mouths, and in corners beside vertices of walls."""
     rng = np.random.default_rng(seed)
@@ -210,22 +199,6 @@ def test_each_tunnel_of_a_stack_has_its_own_distances(plan: st.TunnelPlan) -> No
         found, by_xla = both(joined.walls, position, nodes(joined.pick(i), station))
         assert_equal(found, by_xla)
         assert_equal(found, both(tunnel, position, nodes(tunnel, station))[0])
-
-
-def test_furniture_counts(plan: st.TunnelPlan) -> None:
-    tunnel = Tunnel.from_plan(plan, "furnished")
-    position, station = places(plan, "furnished", 2)
-    found, by_xla = both(tunnel, position, nodes(tunnel, station))
-    assert_equal(found, by_xla)
-    assert np.any(found < both(Tunnel.from_plan(plan), position, nodes(Tunnel.from_plan(plan), station))[0] - 0.1)
-
-
-@pytest.mark.parametrize("n", [1, 33])
-def test_any_number_of_points(plan: st.TunnelPlan, n: int) -> None:
-    tunnel = Tunnel.from_plan(plan)
-    position, station = (part[-n:] for part in places(plan, plan.default_lining, 3))
-    found, by_xla = both(tunnel, position, nodes(tunnel, station))
-    assert_equal(found, by_xla)
 
 
 @pytest.mark.parametrize("bits", [32, 64])

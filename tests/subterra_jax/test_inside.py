@@ -24,26 +24,6 @@ def begin(id, n=N, **overrides):
     return env, params, states(params)
 
 
-@pytest.mark.parametrize(("name", "hidden"), [("StopAt", False), ("Return", True)])
-def test_no_mouth_is_in_sight_of_a_start_or_a_goal(name, hidden):
-    _, params, state = begin(f"Subterra/{name}-v1", hidden_start=hidden)
-    length = float(params.tunnel.length)
-    for station in (state.station, state.goal.station):
-        assert float(station.min()) > SEES
-        assert length - float(station.max()) > SEES
-    assert float(state.goal.told.min()) == pytest.approx(40.0, abs=1.0)
-    assert length - float(state.goal.station.max()) == pytest.approx(40.0, abs=1.0)
-    distance = state.goal.station - state.goal.told
-    room = min(320.0, length - 80.0)
-    assert float(distance.min()) == pytest.approx(60.0, abs=1.0)
-    assert float(distance.max()) == pytest.approx(room, abs=1.0)
-    assert float(distance.mean()) == pytest.approx(0.5 * (60.0 + room), rel=0.03)
-    left = length - 80.0 - distance  # for the start to lie in
-    share = ((state.goal.told - 40.0) / left)[left > 20.0]
-    assert float(share.mean()) == pytest.approx(0.5, abs=0.03)
-    assert float(share.max()) == pytest.approx(1.0, abs=0.05)
-
-
 def test_no_mouth_comes_into_sight_within_the_travel_of_a_relocalisation():
     _, params, state = begin("Subterra/Relocalise-v1")
     margin = SEES + float(params.goal.travel_max)

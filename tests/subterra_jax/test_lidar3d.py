@@ -10,8 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import subterra_jax as st
-from subterra_jax import lidar, lidar3d, native
+from subterra_jax import lidar3d, native
 from subterra_jax.lidar import nvidia
 from subterra_jax.lidar3d import beams, casting, finding, fused
 from subterra_jax.lidar3d.relief import ARRAYS, Relief, stack_reliefs
@@ -172,13 +171,6 @@ def test_a_pose_that_is_no_number_ends_and_gives_no_number(reliefs):
     assert np.isfinite(ranges[1]).all()
 
 
-def test_the_planar_lidars_noise_leaves_a_beam_without_echo_alone(reliefs):
-    ranges = cast(reliefs["tube"], [50.0, 0.0, 0.0], beams.planar(N_BEAMS)[None])[0]
-    noisy = np.asarray(lidar.add_noise(jnp.asarray(ranges), jnp.ones(N_BEAMS), lidar.LidarParams(range_sigma=0.1)))
-    assert noisy[0] == np.float32(30.0)
-    np.testing.assert_allclose(noisy[4], ranges[4] + 0.1, atol=1e-6)
-
-
 def bend_rays(axis, n: int, seed: int):
     """Origins, directions and stations of rays in the bend, half of them nearly level."""
     rng = np.random.default_rng(seed)
@@ -314,22 +306,6 @@ def test_derivatives_are_those_of_finite_differences_off_the_edges(bend, reliefs
     assert not any(slope[value == 30.0].any() for slope in slopes)
 
 
-def test_a_pose_is_found_by_descending_on_one_scan(reliefs):
-    beam = jnp.asarray(beams.spinning(np.deg2rad([-20.0, 0.0, 20.0]), 16))
-    turn = jnp.array([1.0, 0.0, 0.0, 0.0])
-    place = jnp.array([30.0, 0.4, -0.3])
-    scan = lidar3d.scan(reliefs["tube"], place, turn, place[0], beam, 30.0)
-
-    def misfit(p):
-        ranges = lidar3d.scan(reliefs["tube"], p, turn, p[0], beam, 30.0)
-        return jnp.sum(jnp.where((scan < 10.0) & (ranges < 10.0), ranges - scan, 0.0) ** 2)
-
-    guess, slope = jnp.array([30.0, 0.1, 0.1]), jax.jit(jax.grad(misfit))
-    for _ in range(60):
-        guess = guess - 0.005 * slope(guess)
-    np.testing.assert_allclose(guess[1:], place[1:], atol=1e-3)
-
-
 def test_the_page_finds_a_pose_by_descending_on_one_scan():
     page = Path(__file__).parents[2] / "docs" / "api" / "lidar3d.md"
     (code,) = [b for b in re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL) if "def descend" in b]
@@ -368,18 +344,3 @@ def test_a_pattern_that_is_none_is_refused(reliefs, pattern, sentence):
     place = jnp.array([30.0, 0.0, 0.0])
     with pytest.raises(ValueError, match=sentence):
         lidar3d.scan(reliefs["tube"], place, jnp.array([1.0, 0.0, 0.0, 0.0]), place[0], jnp.asarray(pattern), 30.0)
-
-
-def test_a_sensor_in_the_wall_is_refused(reliefs):
-    lidar3d.require_free(reliefs["things"], [30.0, 0.5, 0.5], 30.0)
-    for inside in ([30.0, 2.2, 0.0], [20.0, 0.5, -1.0]):
-        with pytest.raises(st.SubterraError, match=r"the sensor at .* is inside the wall, or in a thing"):
-            lidar3d.require_free(reliefs["things"], inside, inside[0])
-
-
-def test_a_batch_that_cannot_fit_is_refused_with_what_would(reliefs, monkeypatch):
-    monkeypatch.setattr(finding, "device_memory", lambda: 1_000_000)
-    place = jnp.zeros((100, 3)).at[:, 0].set(30.0)
-    beam = jnp.asarray(beams.planar(512))
-    with pytest.raises(st.SubterraError, match=r"51,200 rays .* at most [0-9,]+ at once"):
-        jax.jit(jax.vmap(lidar3d.cast, (None, 0, None, 0, None)))(reliefs["tube"], place, beam, place[:, 0], 30.0)

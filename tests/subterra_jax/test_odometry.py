@@ -15,32 +15,6 @@ N, T = 20_000, 50
 PARAMS = WanderParams(sigma=0.02, length=30.0)
 
 
-def drift(params: odometry.OdometryParams, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Dead-reckoned distance and heading, `(N, T)`, of N episodes at 1 m/s and 0.01 rad/s."""
-    distance, heading = _drift(jax.tree.map(jnp.float32, params), seed)
-    return np.asarray(distance).T, np.asarray(heading).T
-
-
-@jax.jit
-def _drift(params: odometry.OdometryParams, seed: int) -> tuple[jax.Array, jax.Array]:
-    """Series `(T, N)`."""
-    bias_key, noise_key = jax.random.split(jax.random.key(seed))
-    state = jax.vmap(odometry.start_odometry, (0, None))(jax.random.normal(bias_key, (N, 2)), params)
-
-    def step(state, noise):
-        advance = jax.vmap(odometry.advance_odometry, (0, None, None, 0, None))
-        state = advance(state, jnp.array([1.0, 0.01]), jnp.float32(0.1), noise, params)
-        return state, (state.distance, state.heading)
-
-    return jax.lax.scan(step, state, jax.random.normal(noise_key, (T, N, 2)))[1]
-
-
-def test_without_errors_dead_reckoning_is_the_truth():
-    distance, heading = drift(odometry.OdometryParams(0.0, 0.0, 0.0, 0.0))
-    np.testing.assert_allclose(distance, np.broadcast_to(0.1 * np.arange(1, T + 1), (N, T)), rtol=1e-5)
-    np.testing.assert_allclose(heading, np.broadcast_to(0.001 * np.arange(1, T + 1), (N, T)), rtol=1e-5)
-
-
 def test_without_errors_the_observed_odometry_is_the_path_driven():
     env, params = st.make(TASK, odometry=odometry.OdometryParams(0.0, 0.0, 0.0, 0.0))
     _, state = jax.jit(env.reset)(jax.random.key(0), params)

@@ -279,20 +279,6 @@ def test_the_function_gives_an_agent_what_it_declares_and_no_more(name):
     assert float(action[0]) == pytest.approx(speed)
 
 
-@pytest.mark.parametrize(
-    ("name", "task", "message"),
-    [
-        ("TraverseShort-v1", TASK, "TraverseShort-v1: "),
-    ],
-)
-def test_an_evaluation_refuses_the_policy_of_another_task_in_one_sentence(name, task, message):
-    agent, _ = policies.load(name)
-    one = np.zeros(1, np.int32)
-    with pytest.raises(PolicyError, match=message) as refused:
-        evaluate(*st.make(task, "subterra-351"), agent, Episodes(np.zeros(1, np.uint32), one, one, one))
-    assert "\n" not in str(refused.value)
-
-
 def test_an_evaluation_takes_a_policy_as_it_takes_its_agent():
     env, params = st.make(DRIVEN, horizon=5)
     one = np.zeros(2, np.int32)

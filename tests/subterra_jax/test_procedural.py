@@ -101,12 +101,6 @@ def test_a_range_of_names_and_a_list_of_them_are_one_stack_cut_to_the_piece_of_a
         resolve("open:val:3-1", None, None, 30.0)
 
 
-@pytest.mark.parametrize("name", ["procedural:test:7", "open:test", "open:dev:3", "open:val:1000000", "open:val:x"])
-def test_a_name_that_no_tunnel_has_is_refused(name):
-    with pytest.raises(st.TunnelError, match=f"no (tunnel '{name}'|such tunnel file)|{name}: no such tunnel file"):
-        st.load_tunnel(name)
-
-
 def test_where_no_tunnel_is_named_it_is_the_open_worlds_and_the_papers_for_the_papers_task():
     assert st.tasks.tunnel_for("Subterra/StopAt-v1") == "open:train:0-11"
     assert st.tasks.tunnel_for("Subterra/StopAt-v1", split="test-unseen") == "open:test-unseen:0-11"

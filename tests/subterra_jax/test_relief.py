@@ -97,15 +97,6 @@ def test_what_cannot_be_stacked_is_refused():
     assert relief.stack_reliefs([one]) is one
 
 
-def test_planes_of_neighbouring_blocks_are_the_same(sorted_bend):
-    blocks = sorted_bend[0].blocks
-    for k in range(len(blocks.centre) - 1):
-        normal = blocks.turn[k].T @ blocks.front[k, :3]
-        np.testing.assert_allclose(blocks.turn[k + 1].T @ blocks.back[k + 1, :3], normal, atol=1e-6)
-        point = blocks.centre[k] + normal * blocks.front[k, 3]
-        assert (point - blocks.centre[k + 1]) @ normal == pytest.approx(blocks.back[k + 1, 3], abs=1e-6)
-
-
 def test_a_surface_away_from_the_axis_is_refused():
     axis = surfaces.axis_of(30.0)
     far = surfaces.box((500.0, 0.0, 0.0), (1.0, 1.0, 1.0))

@@ -30,13 +30,3 @@ def test_every_triangle_is_delaunays_and_looks_inwards(name, window, monkeypatch
     across, along = ((values[faces] - values[faces[:, :1]])[:, 1:] for values in (u, s))
     across = (across + girth / 2) % girth - girth / 2
     assert (across[:, 0] * along[:, 1] - across[:, 1] * along[:, 0] > 0.0).all()
-
-
-def test_most_of_a_plain_wall_is_known_without_a_search(monkeypatch):
-    sizes = []
-    monkeypatch.setattr(
-        rolled, "_delaunay", lambda u, s, g, real=rolled._delaunay: sizes.append(len(u)) or real(u, s, g)
-    )
-    axis, wall = rolled.raise_shell(open_world.plan("open:rock:test-unseen:49", length=30.0).shell, "smooth")
-    assert axis.station[-1] == pytest.approx(30.0)
-    assert sum(sizes) < 0.2 * len(wall.vertices)

@@ -94,31 +94,6 @@ def first_complaint(env: st.TunnelEnv, params: st.EnvParams, seed: int) -> str |
     return error.get()
 
 
-def test_actions_are_inside_outside_and_extreme():
-    low, high = np.float32([0.0, -1.5]), np.float32([2.0, 1.5])
-    actions = np.asarray(wild_actions(jax.random.key(0), 4096, low, high))
-    assert np.isnan(actions).any()
-    assert np.isposinf(actions).any()
-    assert np.isneginf(actions).any()
-    inside = ((actions >= low) & (actions <= high)).all(axis=1)
-    assert 0.2 < inside.mean() < 0.7
-    assert inside[::8].all()
-    assert (np.abs(actions[np.isfinite(actions)]) > 2.0).any()
-
-
-def test_violations_are_counted_by_name():
-    low, high = np.float32([0.0, -np.inf]), np.float32([30.0, np.inf])
-    state = {"good": jnp.zeros(3), "bad": jnp.array([0.0, jnp.nan]), "steps": jnp.zeros(3, jnp.int32)}
-    obs = jnp.array([[0.0, 1e9], [31.0, 0.0], [jnp.nan, jnp.inf]])
-    found = {k: int(v) for k, v in _violations(state, obs, jnp.array([0.0, jnp.inf]), low, high).items() if v}
-    assert found == {
-        "state['bad'] not finite": 1,
-        "observation outside its space": 2,
-        "observation not finite": 2,
-        "reward not finite": 1,
-    }
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("task", st.TASKS)
 def test_every_task_is_clean_under_wild_actions_and_checkify(task):

@@ -75,13 +75,6 @@ def assert_same(one, other) -> None:
         np.testing.assert_array_equal(a, b)
 
 
-def test_a_stack_gives_bit_for_bit_what_each_tunnel_gives_alone(plans, alone, together):
-    for i, (tunnel, poses) in enumerate(zip(alone, poses_in(plans, 400), strict=True)):
-        own = look(tunnel, jnp.zeros(len(poses.station), jnp.int32), *vars(poses).values())
-        index = jnp.full(len(poses.station), i)
-        assert_same(own, look(together, index, *vars(poses).values()))
-
-
 def test_a_batch_may_mix_the_tunnels_of_a_stack(plans, alone, together):
     several = poses_in(plans, 400)
     n = len(several[0].station)
@@ -101,16 +94,6 @@ def test_each_tunnel_of_a_stack_agrees_with_its_own_walls(plans, together):
         result = reference.agreement(plan.lining(lining).segments, poses, np.asarray(ranges))
         assert result.n_wrong == 0
         assert result.max_error < 1e-3
-
-
-def test_no_window_reaches_the_neighbour(alone, together):
-    ends = np.cumsum([t.grid.shape[0] for t in alone])
-    padding = np.flatnonzero(np.asarray(together.box)[4] < 0.0)
-    window = 1 << (together.n_scan - 1).bit_length()
-    for first, last in zip(np.r_[0, ends[:-1]], ends, strict=True):
-        starts = np.asarray(together.scan_first)[first:last]
-        seen = np.setdiff1d(np.arange(starts.min(), starts.max() + window), padding)
-        assert seen.max() - seen.min() == len(seen) - 1
 
 
 def test_the_kernels_of_a_gpu_see_each_tunnel_of_a_stack(plans, alone):

@@ -60,11 +60,6 @@ def test_a_schema_is_older_newer_or_of_another_file(found, says):
     assert other_schema(found, "subterra.tunnel/1", "build again").startswith(says)
 
 
-def test_an_older_file_is_to_be_made_again_and_a_newer_one_needs_an_update():
-    assert other_schema("a/1", "a/2", "build again").endswith("; build again")
-    assert other_schema("a/3", "a/2", "build again").endswith("; pip install --upgrade subterra-jax")
-
-
 def test_a_tunnel_of_another_version_says_what_to_do(tmp_path):
     old = other(packaged("subterra-351.npz"), tmp_path / "old.npz", "subterra.tunnel/0")
     with pytest.raises(st.TunnelError, match=r"old\.npz: written by an older .* `python -m scene\.build`"):

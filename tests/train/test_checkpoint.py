@@ -60,6 +60,7 @@ def test_what_a_kill_leaves_behind_is_never_read(saved):
     assert checkpoint.load_checkpoint(saved).path.name == "00000009"
 
 
+@pytest.mark.usefixtures("collected")
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # a thread of the storage library's
 def test_a_truncated_checkpoint_is_a_clear_error_whichever_file_it_is(saved, tmp_path):
     place = saved / "checkpoint" / "00000007"
