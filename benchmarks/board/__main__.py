@@ -2,11 +2,8 @@
 
 `python -m benchmarks.board --tasks StopAt Return --out out/board`
 
-Each task and agent is one file under `--out`/cells; a cell that is there is not driven again. `board.md` holds the
-tables, `board.png` the picture, `cells.jsonl` all cells. `--report-only` writes them of the cells that are there, or of
-those in a file `--cells`: `benchmarks/board/cells.jsonl` holds those on record. `--again 20` drives so many episodes of
-each cell on record, or of `--cells`, once more and says whether agents, tasks and tunnels are still those that were
-scored.
+Each task and agent is one file under `--out`/cells; a cell that is there is not driven again. `--report-only` writes
+tables and picture of the cells that are there, or of those in `--cells`: `benchmarks/board/cells.jsonl` is on record.
 """
 
 import json

@@ -50,17 +50,15 @@ class BoardConfig:
     # Splits of the open world; a choice may be made on `val` alone.
     splits: tuple[str, ...] = ("val", "test-seen", "test-unseen")
     episodes: int = 50  # Episodes of each kind and split.
-    tunnels: int = 5  # Tunnels of each kind and split, over which the episodes are spread.
+    tunnels: int = 5  # Tunnels of each kind and split.
     further: tuple[str, ...] = ()  # Names or files of further tunnels, a column each.
     sensor: str = PLANAR  # The LiDAR of agents without a line in the roster, by name.
-    load: tuple[Path, ...] = ()  # Python files to run first, which register tasks, agents or kinds of one's own.
-    # Memory that driving may take at once, GB; an agent that needs more is driven in parts of the episodes.
-    memory: float = 8.0
+    load: tuple[Path, ...] = ()  # Python files to run first, with things of one's own.
+    memory: float = 8.0  # Memory for driving, GB; an agent that needs more drives in parts.
     cache: Path | None = None  # Folder in which made tunnels are kept from run to run.
     report_only: bool = False  # Drive nothing.
-    # File of cells: to report in place of those in `out`, with `report_only`, or to drive again, for those on record.
-    cells: Path | None = None
-    again: int = 0  # Episodes of each cell on record to drive once more, in place of what is missing.
+    cells: Path | None = None  # Cells to report or drive again.
+    again: int = 0  # Episodes of each cell to drive once more.
 
 
 @dataclasses.dataclass(frozen=True)
