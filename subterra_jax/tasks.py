@@ -15,9 +15,11 @@ from subterra_jax import constants as c
 from subterra_jax.adapters import register_tasks
 from subterra_jax.compiled import keep_programs
 from subterra_jax.digest import digest, task_figures
-from subterra_jax.host.errors import SubterraError
+from subterra_jax.host.errors import SubterraError, TunnelError
 from subterra_jax.host.loading import load_module
 from subterra_jax.host.task_ids import BENCHMARK, MISSIONS, PLANAR, WALK, full_id, no_task
+from subterra_jax.host.texture import check_dial
+from subterra_jax.lidar import LidarParams
 from subterra_jax.params import check_length, check_robot, check_together, collect_entries, make_params
 from subterra_jax.parts import Faults, Imu, Obstacles, Odometer, Part, PlanarLidar, Slip
 from subterra_jax.parts.odometer import OdometryParams
@@ -150,6 +152,9 @@ def make(
     parts: Sequence[Part] = (),
     sensor: Any = SENSORS[0],
     sweep: bool = False,
+    intensity: bool = False,
+    doppler: bool = False,
+    texture: float = 0.0,
     hidden_start: bool = False,
     split: str | None = None,
     **overrides: Any,
@@ -173,6 +178,9 @@ def make(
         sensor: The LiDAR: `planar16`, the paper's; `spin16x64`, `vlp16`, `os1-64`, `avia` or unit vectors `(n, 3)`, in
             three dimensions, whose `scan` takes the place of `ranges`; or what `parts.make_sensor` returns.
         sweep: Cast each beam of a LiDAR in three dimensions from the pose at its own time.
+        intensity: Observe the intensity of each return.
+        doppler: Observe the speed of each range, of a LiDAR in three dimensions.
+        texture: Dial of what intensities tell of the walls: from 0, all alike, to 1, an old, wet metro.
         hidden_start: The true start is off the reported one by a normal number of 3 m, cut off at three of them; for
             the tasks that report a start: `StopAt`, `StopAtShort`, `Return`, `Obstructed` and `Faulted`.
         split: In place of `tunnel`, those of another split of the open world: `train`, `val`, `test-seen` or
@@ -206,11 +214,16 @@ def make(
         return walking.make_mission(id, tunnel, lining, sensor=sensor, sweep=sweep, **overrides)  # type: ignore[arg-type]
     task = TASKS[id]
     spatial = not is_planar(sensor)
+    check_dial(texture)
+    channels: dict[str, Any] = {"intensity": intensity} if intensity else {}
+    channels |= {"texture": texture} if texture else {}
     if spatial:
         made = sensor if isinstance(sensor, SpatialParams) else make_sensor(sensor)
-        overrides = {"lidar": dataclasses.replace(made, sweep=sweep or made.sweep), **overrides}
+        channels |= {"doppler": doppler or made.doppler, "sweep": sweep or made.sweep}
+        overrides = {"lidar": dataclasses.replace(made, **channels), **overrides}
     else:
-        _require_planar(id, sensor, sweep)
+        _require_planar(id, sensor, sweep, doppler)
+        overrides = {"lidar": LidarParams(**channels), **overrides} if channels else overrides
     own = [SpatialLidar() if spatial and isinstance(part, PlanarLidar) else part for part in task.parts]
     if wrong := [part for part in parts if not isinstance(part, Part)]:
         raise ValueError(f"parts must hold subterra_jax.parts.Part alone, got {wrong[0]!r}")
@@ -221,7 +234,10 @@ def make(
     entries = collect_entries(env, {**task.params, **overrides})
     check_robot(entries)
     reach = c.RANGE_MAX if spatial else float(np.max(entries["lidar"].range_max))
-    params = make_params(env, resolve(tunnel, lining, task.piece, reach, spatial), horizon, entries)
+    placed = resolve(tunnel, lining, task.piece, reach, spatial)
+    if entries["lidar"].texture is not None and np.any(np.asarray(placed.texture) < 0):
+        raise TunnelError(f"{tunnel}: has no field 'texture', the seed of its walls' brightness: use texture=0")
+    params = make_params(env, placed, horizon, entries)
     check_together(env, params)
     check_length(env, params)
     return env, params
@@ -287,12 +303,14 @@ def _checked_horizon(horizon: Any) -> Any:
     return horizon
 
 
-def _require_planar(id: str, sensor: Any, sweep: bool) -> None:
-    """Refuse another LiDAR than the planar one, or its sweep."""
+def _require_planar(id: str, sensor: Any, sweep: bool, doppler: bool = False) -> None:
+    """Refuse another LiDAR than the planar one, or what that lacks."""
     if not is_planar(sensor):
         raise ValueError(f"{id} has the sensor {SENSORS[0]!r} alone, got {sensor!r}")
     if sweep:
         raise ValueError(f"{SENSORS[0]!r} measures a scan at one moment: sweep=True needs a LiDAR in three dimensions")
+    if doppler:
+        raise ValueError(f"{SENSORS[0]!r} has no Doppler channel: doppler=True needs a LiDAR in three dimensions")
 
 
 def constants_digest(env: TunnelEnv | None = None, params: EnvParams | None = None) -> str:

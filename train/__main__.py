@@ -46,6 +46,8 @@ class Command:
     lining: str | None = None  # variant of the walls; the tunnel's usual one if left out
     # LiDAR; `planar16` is the task's own
     sensor: Literal["planar16", "spin16x64", "vlp16", "os1-64", "avia"] = "planar16"
+    intensity: bool = False  # the LiDAR gives intensities too
+    texture: float = 0.0  # what they tell of the walls: from 0, all alike, to 1, an old, wet metro
     hidden_start: bool = False  # the true start is off the one that is reported
     val: Path | None = None  # tunnels of the evaluation after training; those of the training if left out
     preset: str | None = None  # `cpu` or `gpu`; what jax runs on if left out
@@ -131,8 +133,10 @@ def _world(arguments: Command) -> World:
             arguments.val,
             arguments.preset,
             arguments.hidden_start,
+            arguments.intensity,
+            arguments.texture,
         )
-    for name, usual in (("sensor", "planar16"), ("hidden_start", False), ("val", None)):
+    for name, usual in (("sensor", "planar16"), ("intensity", False), ("hidden_start", False), ("val", None)):
         if (given := getattr(arguments, name)) != usual:
             raise ConfigError(f"{name} = {given} is for embodiment = scout; with b2 it is {usual}")
     from train.b2 import embodied  # MuJoCo is loaded only where legs are meant

@@ -19,7 +19,7 @@ from train.config import ConfigError
 from train.log import print_table
 from train.policies import open_agent
 from train.without import Part, without
-from train.world import PLANAR, World, open_world
+from train.world import World, lidar_of, open_world
 
 _BATCH = 500
 
@@ -88,8 +88,8 @@ def command(arguments: Command) -> None:
     """Evaluates the policy and prints its scores."""
     check_episodes(arguments.episodes)
     agent, facts = open_agent(arguments.policy, arguments.task)
-    sensor = facts.get("world", {}).get("sensor", PLANAR)
-    world = open_world(arguments.task or facts["task"], arguments.tunnel, arguments.lining, sensor)
+    shown = lidar_of(facts.get("world", {}))
+    world = open_world(arguments.task or facts["task"], arguments.tunnel, arguments.lining, **shown)
     source = arguments.policy or agent.name
     released.check_fits(agent, world.env, world.params, source)
     if arguments.without is not None:

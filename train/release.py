@@ -21,7 +21,7 @@ from train.config import ConfigError, Legs
 from train.evaluate import evaluate
 from train.log import print_table
 from train.policies import write_tensors
-from train.world import PLANAR, World, library_versions, open_world
+from train.world import World, library_versions, lidar_of, open_world
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,7 +62,7 @@ def command(arguments: Command) -> None:
 def _world(stored: dict[str, Any], arguments: Command) -> World:
     """Opens the world to score in: of the robot that was trained, or of the stand-in of one on legs."""
     if stored["world"].get("embodiment") is None:
-        return open_world(stored["task"], arguments.tunnel, arguments.lining, stored["world"].get("sensor", PLANAR))
+        return open_world(stored["task"], arguments.tunnel, arguments.lining, **lidar_of(stored["world"]))
     from train.b2 import embodied  # MuJoCo is loaded only where legs are meant
 
     return embodied.open_world(stored["task"], arguments.tunnel, arguments.lining, Legs(robots=0))

@@ -113,6 +113,8 @@ def open_world(
     val: Path | str | None = None,
     preset: str | None = "cpu",
     hidden_start: bool = False,
+    intensity: bool = False,
+    texture: float = 0.0,
 ) -> World:
     """Opens a task on a tunnel.
 
@@ -125,6 +127,8 @@ def open_world(
         val: Tunnels of the evaluation after training; None is `tunnel`.
         preset: Says how many tunnels are a few.
         hidden_start: The true start is off the one that is reported.
+        intensity: The LiDAR gives intensities too.
+        texture: Dial of what they tell, as for `st.make`.
 
     Raises:
         ConfigError: There is no such task or sensor, or the tunnel has no room for it.
@@ -133,18 +137,24 @@ def open_world(
     task = require_task(task)
     if tunnel is None and st.TASKS[task].rule.errand != "cover":
         tunnel = _TUNNELS[preset or "cpu"]
-    world = _open(task, tunnel, lining, sensor, hidden_start)
-    return world if val is None else dataclasses.replace(world, val=_open(task, val, lining, sensor, hidden_start))
+    chosen = {"hidden_start": hidden_start, "intensity": intensity, "texture": texture}
+    world = _open(task, tunnel, lining, sensor, chosen)
+    return world if val is None else dataclasses.replace(world, val=_open(task, val, lining, sensor, chosen))
 
 
-def _open(task: str, tunnel: Path | str | None, lining: str | None, sensor: str, hidden_start: bool) -> World:
+def lidar_of(facts: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the arguments of `open_world` that say what a world's LiDAR shows."""
+    return {name: facts[name] for name in ("sensor", "intensity", "texture") if name in facts}
+
+
+def _open(task: str, tunnel: Path | str | None, lining: str | None, sensor: str, chosen: dict[str, Any]) -> World:
     names: list[Any] = [tunnel] if tunnel is None else [*tunnels.names_of(str(tunnel))]
     several = len(names) > 1
     given: Any = names if several else names[0]
     try:
         if several and sensor != PLANAR:
             given = tunnels.load(names, lining, None, sensor, st.TASKS[task].piece)
-        env, params = st.make(task, given, lining, sensor=sensor, hidden_start=hidden_start)
+        env, params = st.make(task, given, lining, sensor=sensor, **chosen)
     except st.SubterraError:
         raise
     except ValueError as error:
@@ -160,9 +170,7 @@ def _open(task: str, tunnel: Path | str | None, lining: str | None, sensor: str,
     }
     if sensor != PLANAR:
         facts["sensor"] = sensor
-    if hidden_start:
-        facts["hidden_start"] = True
-    return World(task, env, params, facts)
+    return World(task, env, params, facts | {name: value for name, value in chosen.items() if value})
 
 
 def _digest(names: list[Any]) -> str:

@@ -2,16 +2,20 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Bool, Float, Float32, UInt8
 
+from scene.survey.alignment import Alignment
 from scene.survey.carrier import Carried, rotate
 from scene.survey.config import SensorErrors
 from scene.survey.lidar import SCAN_PERIOD, Lidar, Sweep
 from scene.survey.mesh import Mesh, Part
+from scene.survey.section import Section
+from subterra_jax.host.texture import brightness, wall_angle
 
 _WINDOW = 60.0  # m of progress for which one scene serves
 _REACH = 190.0  # m loaded ahead of it, and behind it for LiDARs that look back; the longest range of any
@@ -78,17 +82,44 @@ ALBEDO[[Part.FLOOR, Part.SLEEPER, Part.RAIL, Part.FASTENING]] = 0.20, 0.36, 0.42
 ALBEDO[[Part.THING, Part.TERRAIN, Part.DARK]] = 0.35, 0.25, 0.0  # grass and earth outside; black sheets on the lining
 
 
-def draw_returns(rng: np.random.Generator, lidar: Lidar, errors: SensorErrors, hits: Hits) -> Bool[np.ndarray, "n"]:
+class Face:
+    """Brightness of the lining, fixed to the wall: factors on its reflectivity."""
+
+    def __init__(self, alignment: Alignment, section: Section, texture: float, seed: int) -> None:
+        self._alignment, self._section = alignment, section
+        self._texture, self._seed = texture, seed
+
+    def __call__(
+        self, station: float, points: Float[np.ndarray, "n 3"], part: UInt8[np.ndarray, "n"]
+    ) -> Float[np.ndarray, "n"]:
+        """Return the factors of points on some parts, m in the survey frame, seen from about a station, m."""
+        own = np.flatnonzero(np.isin(part, (Part.LINING, Part.JOINT, Part.POCKET, Part.FLOOR)))
+        at, shown = np.full(len(own), station), points[own]
+        for _ in range(3):
+            frames = self._alignment.frames(at)
+            away = shown - frames.position
+            at = at + np.einsum("ij,ij->i", away, frames.tangent)
+        left = np.einsum("ij,ij->i", away, frames.lateral)
+        above = np.einsum("ij,ij->i", away, frames.up) + 0.5 * self._section.height(at)
+        factors = np.ones(len(part))
+        factors[own] = brightness(np, at, wall_angle(np, left, above), self._seed, self._texture)
+        return factors
+
+
+def draw_returns(
+    rng: np.random.Generator, lidar: Lidar, errors: SensorErrors, hits: Hits, factor: Any = 1.0
+) -> Bool[np.ndarray, "n"]:
     """Draws which pulses come back.
 
     The echo is albedo · cos(incidence) / distance², faded by a log-normal factor; it returns if it exceeds the
-    weakest that the LiDAR detects. On a concrete wall beside the track that ends the Avia's view at about 60 to 70 m.
+    weakest that the LiDAR detects; `factor` is on the albedo. On a concrete wall beside the track that ends the Avia's
+    view at about 60 to 70 m.
     A surface that is hit from behind never returns.
     """
     distance, cosine = hits.distance, hits.cosine
     seen = (distance >= lidar.range_min) & (distance <= lidar.range_max) & (cosine > 0.0)
     if errors.weak_echoes:
-        echo = ALBEDO[hits.part] * cosine * np.exp(FADING * rng.standard_normal(len(distance), np.float32))
+        echo = factor * ALBEDO[hits.part] * cosine * np.exp(FADING * rng.standard_normal(len(distance), np.float32))
         seen &= echo > lidar.weakest_echo * distance * distance
     return seen & (rng.random(len(distance), np.float32) >= errors.lost)
 
@@ -147,13 +178,15 @@ def mix_pixels(
 
 
 def draw_reflectivity(
-    rng: np.random.Generator, cosine: Float32[np.ndarray, "n"], part: UInt8[np.ndarray, "n"]
+    rng: np.random.Generator, cosine: Float32[np.ndarray, "n"], part: UInt8[np.ndarray, "n"], factor: Any = 1.0
 ) -> UInt8[np.ndarray, "n"]:
     """Draws reported reflectivity: 0 to 150 for 0 to 100 % diffuse, as Livox scales it, with 5 % noise."""
-    value = 150.0 * ALBEDO[part] * cosine * (1.0 + 0.05 * rng.standard_normal(len(part), np.float32))
+    value = 150.0 * factor * ALBEDO[part] * cosine * (1.0 + 0.05 * rng.standard_normal(len(part), np.float32))
     return np.clip(np.rint(value), 0, 255).astype(np.uint8)
 
 
+DOPPLER_SIGMA = 0.03  # m/s. Source: Aeva's Aeries II, 3 cm/s
+_INSTANT = 0.005  # s to either side, over which the sensor's speed is taken
 _RAYS_AT_ONCE = 240_000  # large enough for numpy, small enough for the memory
 _SECOND_RETURN = 0.02  # share of returns marked as second ones
 
@@ -175,11 +208,14 @@ def sweeps(
     errors: SensorErrors,
     every: int = 1,
     veil: Veil | None = None,
+    face: Face | None = None,
+    doppler: bool = False,
 ) -> Iterator[Sweep]:
     """Yields every `every`-th sweep in order of time; every point is cast from the pose at its own time.
 
     Without `distortion` in `errors`, all points of a sweep are measured at its stamp, and say so. A `veil` stands
-    before every surface, as dust does.
+    before every surface, as dust does. A `face` makes the lining brighter in places. `doppler` measures the speed of
+    each range, positive away.
     """
     phase = rng.uniform(0.0, 2.0 * np.pi, 2)
     offset = lidar.offset if errors.distortion else np.full_like(lidar.offset, lidar.stamp)
@@ -197,7 +233,11 @@ def sweeps(
         if veil is not None:
             hits = veil(rng, ray, hits)
 
-        valid = draw_returns(rng, lidar, errors, hits)
+        factor: Any = 1.0
+        if face is not None:
+            ends = poses.position + np.where(np.isfinite(hits.distance), hits.distance, 0.0)[:, None] * heading
+            factor = face(float(carried.walk.station(begin[:1])[0]), ends, hits.part)
+        valid = draw_returns(rng, lidar, errors, hits, factor)
         distance = hits.distance
         if errors.mixed_pixels > 0.0:
             distance = mix_pixels(rng, lidar, errors.mixed_pixels, caster, poses.position, heading, hits)
@@ -206,12 +246,20 @@ def sweeps(
         # Rounded once, here: the cloud and the bag then hold the same point.
         seen = np.where(valid, distance + sigma * rng.standard_normal(len(ray), np.float32), 0.0).astype(np.float32)
         points = (seen[:, None] * ray).astype(np.float32)
-        reflectivity = np.where(valid, draw_reflectivity(rng, hits.cosine, hits.part), 0).astype(np.uint8)
+        reflectivity = np.where(valid, draw_reflectivity(rng, hits.cosine, hits.part, factor), 0).astype(np.uint8)
         second = valid & (rng.random(len(ray), np.float32) < _SECOND_RETURN)
         placed = poses.position + seen[:, None] * heading
+        velocity = None
+        if doppler:
+            times = (begin[:, None] + 1e-9 * offset).ravel()
+            later, earlier = (carried.poses_between(begin[0] + t, times + t).position for t in (_INSTANT, -_INSTANT))
+            closing = np.einsum("ij,ij->i", later - earlier, heading) / (2.0 * _INSTANT)
+            noisy = DOPPLER_SIGMA * rng.standard_normal(len(ray)) - closing
+            velocity = np.where(valid, noisy, 0.0).astype(np.float32)
         for k, number in enumerate(batch):
             of = slice(k * n, (k + 1) * n)
             yield Sweep(
                 int(number), round(SCAN_PERIOD * 1e9) * int(number), offset, valid[of], points[of], reflectivity[of],
                 second[of], placed[of],
+                None if velocity is None else velocity[of],
             )  # fmt: skip

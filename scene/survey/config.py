@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 import tyro
 
 from scene.survey.conventions import Convention
+from subterra_jax.host.texture import check_dial
 
 LidarName = Literal["avia", "vlp16", "os1"]
 TruthName = Literal[
@@ -52,6 +53,7 @@ class SurveyConfig:
     seed: int = 0  # Draws all that is random; the same seed gives the same bytes.
     # Draw sizes (gauge, rings, pockets ...) within building tolerance.
     tolerances: bool = False
+    texture: float = 0.0  # Brightness of the lining: from 0, all alike, to 1, an old, wet metro.
     correlation: float = 2.0  # Correlation length of the walls of `irregular`, m.
     # LiDARs, each with its own recording; with none, the truth alone.
     sensors: tuple[LidarName, ...] = ("avia",)
@@ -86,6 +88,7 @@ def check_survey(config: SurveyConfig) -> None:
         raise ValueError(f"sensors must differ from each other, got {' '.join(config.sensors)}")
     if config.cloud and not config.sensors:
         raise ValueError("cloud needs a sensor, got none")
+    check_dial(config.texture)
     _check_errors(config.errors)
     config.convention.check()
     # The nearest existing parent decides whether the folder can be made.

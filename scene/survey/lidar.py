@@ -51,6 +51,7 @@ class Sweep:
     reflectivity: UInt8[np.ndarray, "n"]  # 0 to 150 for 0 to 100 % diffuse; 0 where nothing returned
     second: Bool[np.ndarray, "n"]  # Returns marked as the second of their beam
     placed: Float[np.ndarray, "n 3"]  # Points in the survey frame by the true poses, m; meaningless where not `valid`
+    velocity: Float32[np.ndarray, "n"] | None = None  # Speed of each range, m/s, of a LiDAR that measures it
 
 
 AVIA_POINT_RATE = 240_000  # points/s [geode.md]

@@ -128,14 +128,20 @@ def encode_cloud(seq: int, stamp: int, frame: bytes, rows: int, points: np.ndarr
 
 
 def velodyne_message(sweep: Sweep, lidar: Lidar) -> bytes:
-    """Serialises a VLP-16's sweep: one row of returns; `time` counts from a stamp at the sweep's end, s."""
+    """Serialises a VLP-16's sweep: one row of returns; `time` counts from a stamp at the sweep's end, s.
+
+    A Doppler LiDAR adds `velocity`, m/s, positive away.
+    """
     seen = sweep.valid
-    points = np.zeros(int(seen.sum()), VELODYNE_POINT)
+    further = [] if sweep.velocity is None else [("velocity", "<f4")]
+    points = np.zeros(int(seen.sum()), np.dtype([*VELODYNE_POINT.descr, *further]))
     points["x"], points["y"], points["z"] = sweep.points[seen].T
     # Velodyne's scale ends at 100 for diffuse surfaces.
     points["intensity"] = np.rint(sweep.reflectivity[seen] / 1.5)
     points["ring"] = lidar.line[seen]
     points["time"] = 1e-9 * (sweep.offset - lidar.stamp)[seen]
+    if sweep.velocity is not None:
+        points["velocity"] = sweep.velocity[seen]
     return encode_cloud(sweep.number, sweep.begin + lidar.stamp, b"velodyne", 1, points, dense=True)
 
 

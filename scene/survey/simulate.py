@@ -25,7 +25,7 @@ from scene.survey.carrier import (
     measure_inertial,
     measure_prism,
 )
-from scene.survey.cast import Caster, n_sweeps, sweeps
+from scene.survey.cast import Caster, Face, n_sweeps, sweeps
 from scene.survey.config import LidarName, SurveyConfig
 from scene.survey.conventions import Convention, Recorder, encode, kind_of
 from scene.survey.lidar import SCAN_PERIOD, Lidar, Sweep, avia, os1, vlp16
@@ -138,7 +138,8 @@ def simulate(config: SurveyConfig, console: Console) -> str:
     parts = [f"{config.out}: {config.length:g} m"]
     # A sensor's noise does not depend on which others are on the rack.
     seeds = dict(zip(LIDARS, of_sensors.spawn(len(LIDARS)), strict=True))
-    jobs = [(config, name, walk, mesh, seeds[name]) for name in config.sensors]
+    face = Face(bore.alignment, bore.section, config.texture, config.seed) if config.texture else None
+    jobs = [(config, name, walk, mesh, face, seeds[name]) for name in config.sensors]
     apart = jobs[1:] if config.length >= _WORTH_A_PROCESS else []
     with ExitStack() as stack:
         waiting = []
@@ -152,7 +153,13 @@ def simulate(config: SurveyConfig, console: Console) -> str:
 
 
 def _simulate_device(
-    config: SurveyConfig, name: LidarName, walk: Walk, mesh: Mesh, seed: np.random.SeedSequence, console: Console
+    config: SurveyConfig,
+    name: LidarName,
+    walk: Walk,
+    mesh: Mesh,
+    face: Face | None,
+    seed: np.random.SeedSequence,
+    console: Console,
 ) -> str:
     of_lidar, *of_imus = seed.spawn(1 + len(IMUS[name]))
     one, carried = make_device(name, config), Carried(walk, LIDARS[name])
@@ -163,7 +170,7 @@ def _simulate_device(
 
     every = 1 if name == "avia" else config.scan_every
     caster = Caster(mesh, _BEHIND.get(name, one.lidar.range_max))
-    seen = sweeps(np.random.default_rng(of_lidar), one.lidar, carried, caster, config.errors, every)
+    seen = sweeps(np.random.default_rng(of_lidar), one.lidar, carried, caster, config.errors, every, face=face)
     count = n_sweeps(carried, every)
     with ExitStack() as stack:
         cloud = None

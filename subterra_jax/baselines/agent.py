@@ -101,7 +101,7 @@ class Agent(Protocol):
         """
 
 
-LIDAR_ENTRIES = frozenset({"ranges", "scan", "intensity"})
+LIDAR_ENTRIES = frozenset({"ranges", "scan", "intensity", "doppler"})
 
 
 def n_ranges(params: EnvParams) -> int:
@@ -113,6 +113,14 @@ def n_ranges(params: EnvParams) -> int:
 def level_ranges(obs: Observed, params: EnvParams) -> Float[Array, "n"]:
     """Return all level beams that there are, m: `Observed.ranges`, or the whole ring of a LiDAR in three dimensions."""
     return level_row(obs.entries["scan"], params.lidar.shape) if "scan" in obs.entries else obs.ranges
+
+
+def level_intensity(obs: Observed, params: EnvParams, whole: bool = False) -> Float[Array, "n"] | None:
+    """Return the intensities of `Observed.ranges`, or `whole` of `level_ranges`; `None` without the channel."""
+    if "intensity" not in obs.entries:
+        return None
+    shape, seen = getattr(params.lidar, "shape", None), obs.entries["intensity"]
+    return seen if shape is None else (level_row if whole else level_ring)(seen, shape)
 
 
 def range_sigma(params: EnvParams) -> float:

@@ -2,7 +2,7 @@
 
 The walls seen lately are kept as two profiles, distance from the axis over station, in a ring of bins. New scans are
 matched with them at several shifts along the axis. A Kalman filter of station and scale uses informative matches. Of a
-LiDAR in three dimensions it uses a whole level ring.
+LiDAR in three dimensions it uses a whole level ring. Intensities make two further profiles, matched alike.
 """
 
 import dataclasses
@@ -12,7 +12,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from subterra_jax.baselines.agent import Known, Observed, level_ranges, range_sigma
+from subterra_jax.baselines.agent import Known, Observed, level_intensity, level_ranges, range_sigma
 from subterra_jax.baselines.cloud import CloudParams, cloud_params
 from subterra_jax.baselines.navigator import Navigator
 from subterra_jax.baselines.reckoning import Reckoning, begin_reckoning, odometer_share, reckon, unobserved_distance
@@ -36,6 +36,7 @@ class MatchParams:
 
     range_sigma: float | Float[Array, ""] = 0.05  # standard deviation of a range, m
     wall_sigma: float = 0.05  # standard deviation of one entry of the profile, m
+    face_sigma: float = 0.12  # standard deviation of the logarithm of one brightness in a bin, 1
     reach: float = 9.0  # longest range used, m
     lateral_sigma: float = 0.01  # standard deviation of the offset after one step of dead reckoning, m
     heading_sigma: float = 0.003  # standard deviation of the heading, rad
@@ -80,8 +81,14 @@ def scan_points(
     return along, lateral, sigma, ranges < params.reach
 
 
-def add_scan(profile: WallProfile, pose: AxisPose, ranges: Float[Array, "n_beams"], params: MatchParams) -> WallProfile:
-    """Adds a scan to the profile; bins that held an earlier part of the tunnel begin anew."""
+def add_scan(
+    profile: WallProfile,
+    pose: AxisPose,
+    ranges: Float[Array, "n_beams"],
+    params: MatchParams,
+    face: Float[Array, "n_beams"] | None = None,
+) -> WallProfile:
+    """Adds a scan, or its `face`, to the profile; bins that held an earlier part of the tunnel begin anew."""
     along, lateral, _, useful = scan_points(pose, ranges, params)
     index = jnp.floor((pose.station + along) / BIN).astype(jnp.int32)
     side, column = jnp.where(lateral > 0.0, 0, 1), jnp.mod(index, N_BINS)
@@ -89,9 +96,8 @@ def add_scan(profile: WallProfile, pose: AxisPose, ranges: Float[Array, "n_beams
     column = jnp.where(useful, column, N_BINS)
     fresh = profile.stamp[side, jnp.minimum(column, N_BINS - 1)] != index
     keep = jnp.where(fresh, 0.0, 1.0)
-    total = (
-        profile.total.at[side, column].multiply(keep, mode="drop").at[side, column].add(jnp.abs(lateral), mode="drop")
-    )
+    value = jnp.abs(lateral) if face is None else face
+    total = profile.total.at[side, column].multiply(keep, mode="drop").at[side, column].add(value, mode="drop")
     count = profile.count.at[side, column].multiply(keep, mode="drop").at[side, column].add(1.0, mode="drop")
     stamp = profile.stamp.at[side, column].set(index, mode="drop")
     return WallProfile(total, count, stamp, profile.seen_from.at[side, column].set(pose.station, mode="drop"))
@@ -150,12 +156,17 @@ class Match:
 
 
 def mismatch(
-    profile: WallProfile, pose: AxisPose, ranges: Float[Array, "n_beams"], params: MatchParams
+    profile: WallProfile,
+    pose: AxisPose,
+    ranges: Float[Array, "n_beams"],
+    params: MatchParams,
+    face: Float[Array, "n_beams"] | None = None,
 ) -> Float[Array, "n_shifts"]:
     """Computes the cost of a scan at each shift along the axis: half a robust square of the residuals.
 
     At each shift offset, heading and bend are adjusted by weighted least squares, with their predictions as priors.
-    Costs of successive scans are summed, because one scan of a few beams contains little information.
+    Costs of successive scans are summed, because one scan of a few beams contains little information. With a `face` the
+    profile is one of brightness, which no adjustment changes.
     """
     along, lateral, sigma, useful = scan_points(pose, ranges, params)
     shift = jnp.asarray(_SHIFTS, jnp.float32)[:, None]
@@ -166,11 +177,16 @@ def mismatch(
     old = jnp.abs(pose.station - profile.seen_from[side, column]) > params.least_age
     known = useful & (profile.stamp[side, column] == index) & old
     wall = profile.total[side, column] / jnp.maximum(count, 1.0)
-    residual = jnp.where(known, lateral - jnp.where(side == 0, wall, -wall), 0.0)
-    variance = sigma * sigma + params.wall_sigma**2 / jnp.maximum(count, 1.0)
+    if face is None:
+        residual = jnp.where(known, lateral - jnp.where(side == 0, wall, -wall), 0.0)
+        variance = sigma * sigma + params.wall_sigma**2 / jnp.maximum(count, 1.0)
+    else:
+        residual = jnp.where(known, face - wall, 0.0)
+        variance = jnp.broadcast_to(params.face_sigma**2 * (1.0 + 1.0 / jnp.maximum(count, 1.0)), residual.shape)
     weight = jnp.where(known, 1.0 / (variance * (1.0 + residual * residual / (6.0 * variance))), 0.0)
-    change = solve_adjustment(residual, along, weight, params)
-    residual = residual + change[0][:, None] + along * (change[1][:, None] - 0.5 * along * change[2][:, None])
+    if face is None:
+        change = solve_adjustment(residual, along, weight, params)
+        residual = residual + change[0][:, None] + along * (change[1][:, None] - 0.5 * along * change[2][:, None])
     each = jnp.where(known, 3.0 * jnp.log1p(residual * residual / (6.0 * variance)), 0.0)
     # A beam at an unknown bin costs the average of the others, so that it favours no shift.
     usual = jnp.sum(each) / jnp.maximum(jnp.sum(known), 1)
@@ -196,11 +212,21 @@ def best_match(cost: Float[Array, "n_shifts"], params: MatchParams) -> Match:
     return Match(shift, information, (least == inner) & (information > params.least_information))
 
 
+def log_face(pose: AxisPose, obs: Observed, params: EnvParams) -> Float[Array, "n_beams"] | None:
+    """Returns the logarithm of the brightness of what each beam meets, freed of incidence; None without intensities."""
+    seen = level_intensity(obs, params, whole=True)
+    if seen is None:
+        return None
+    angle = jnp.asarray(bearings(seen.shape[0]), jnp.float32) + pose.heading
+    return jnp.log(jnp.maximum(seen, 1.0) / jnp.maximum(jnp.abs(jnp.sin(angle)), 0.05))
+
+
 @struct.dataclass
 class MatchMemory:
     """Memory of the scan matcher."""
 
     profile: WallProfile  # the walls seen lately
+    faces: WallProfile | None  # their brightness, with intensities
     pose: AxisPose  # estimated pose
     scale: Float[Array, ""]  # relative error of dead reckoning, 1
     # variance of the station against the profile (m²), covariance with the scale (m), variance of the scale (1)
@@ -231,6 +257,7 @@ class ScanMatcher(Localiser):
         pose = AxisPose(told_start(obs, params), corridor.offset, corridor.angle, zero, half_width)
         return MatchMemory(
             profile=empty_profile(),
+            faces=empty_profile() if "intensity" in obs.entries else None,
             pose=pose,
             scale=zero,
             covariance=jnp.stack([zero, zero, _prior(self.motion)]),
@@ -250,6 +277,9 @@ class ScanMatcher(Localiser):
         ranges = level_ranges(obs, params)
         pose = centre(pose, ranges, self.params)
         cost = memory.cost + mismatch(memory.profile, pose, ranges, self.params)
+        face = log_face(pose, obs, params)
+        if memory.faces is not None:
+            cost = cost + mismatch(memory.faces, pose, ranges, self.params, face)
         travelled = memory.travelled + jnp.abs(distance)
         due = travelled >= self.window
         match = best_match(cost, self.params)
@@ -257,6 +287,7 @@ class ScanMatcher(Localiser):
         pose, scale, covariance = _fuse(pose, match, memory.scale, covariance)
         cost, travelled = jnp.where(due, 0.0, cost), jnp.where(due, 0.0, travelled)
         profile = add_scan(memory.profile, pose, ranges, self.params)
+        faces = None if memory.faces is None else add_scan(memory.faces, pose, ranges, self.params, face)
         # The station is never corrected against the start: errors of the scale add up.
         sigma = memory.sigma + jnp.abs(distance) * jnp.sqrt(covariance[2])
         forward = jnp.cos(pose.heading)
@@ -265,7 +296,7 @@ class ScanMatcher(Localiser):
             jnp.log(jnp.maximum(sigma, _LEAST_SIGMA)),
             jnp.where(forward > 0.0, 1.0, -1.0),
         )
-        return estimate, MatchMemory(profile, pose, scale, covariance, sigma, cost, travelled, reckoning)
+        return estimate, MatchMemory(profile, faces, pose, scale, covariance, sigma, cost, travelled, reckoning)
 
 
 def scan_matching(params: EnvParams) -> Navigator:

@@ -26,12 +26,16 @@ class LidarParams:
         range_sigma: Standard deviation of the range noise, m.
         n_beams: Beams in one scan; fixes array shapes, so it is static.
         fused: Use kernels where there are any, for NVIDIA GPUs and for CPUs with numba; off, XLA does it everywhere.
+        intensity: Observe intensities too, of a wall without pockets.
+        texture: Dial of the walls' texture, 0 to 1; `None` has none, and costs nothing.
     """
 
     range_max: float = constants.RANGE_MAX
     range_sigma: float = constants.RANGE_SIGMA
     n_beams: int = struct.field(pytree_node=False, default=constants.N_BEAMS)
     fused: bool = struct.field(pytree_node=False, default=True)
+    intensity: bool = struct.field(pytree_node=False, default=False)
+    texture: Float[Array, ""] | float | None = None
 
 
 def scan(

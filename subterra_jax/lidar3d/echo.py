@@ -1,6 +1,4 @@
-"""Errors of a LiDAR's ranges: noise by range and incidence, lost returns, mixed pixels, and intensity by material."""
-
-from typing import Any
+"""Errors of a LiDAR's ranges: noise by range and incidence, lost returns, mixed pixels; reflectivity by material."""
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +14,6 @@ PULSE = 0.75  # m: echoes further apart in range are told apart by the receiver;
 LEVEL = 0.8  # least upward part of a floor's normal
 # Diffuse reflectivity near 905 nm: concrete lining, floor, things of the track and furniture. Engineering judgement.
 ALBEDO_LINING, ALBEDO_FLOOR, ALBEDO_THING = 0.30, 0.20, 0.36
-FULL_SCALE, SCALE_SIGMA = 150.0, 0.05  # reported for 100 % diffuse, as Livox scales it; relative noise
 
 
 @struct.dataclass
@@ -128,17 +125,3 @@ def mix(
     step = other - ranges
     edge = (jnp.abs(step) < PULSE) & (jnp.abs(off_plane) > EDGE_STEP) & (uniform[:, 0] < params.mixed)
     return jnp.where(edge, ranges + step * uniform[:, 1], ranges)
-
-
-def intensity(
-    cosine: Float[Array, "n"], reflectivity: Float[Array, "n"], normal: Float[Array, "n"]
-) -> Float[Array, "n"]:
-    """Return reported intensities: 0 to 150 for 0 to 100 % diffuse, with 5 % noise.
-
-    Args:
-        cosine: Cosine of incidence, 0 to 1.
-        reflectivity: Reflectivity of what is met.
-        normal: Standard normal numbers.
-    """
-    value: Any = FULL_SCALE * reflectivity * cosine * (1.0 + SCALE_SIGMA * normal)
-    return jnp.clip(value, 0.0, 255.0)

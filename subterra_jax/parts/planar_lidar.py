@@ -8,6 +8,8 @@ import numpy as np
 from jaxtyping import Array
 
 from subterra_jax import lidar
+from subterra_jax.lidar3d import echo
+from subterra_jax.parts.brightness import MOST, intensity, wall_brightness
 from subterra_jax.parts.part import Bounds, Noise, Part, Sight
 from subterra_jax.state import EnvParams
 
@@ -23,13 +25,24 @@ class PlanarLidar(Part):
         return {"lidar": lidar.LidarParams()}
 
     def normals(self, params: EnvParams) -> int:
-        return params.lidar.n_beams
+        return params.lidar.n_beams * (1 + params.lidar.intensity)
 
     def observe(self, own: Any, sight: Sight, noise: Noise, params: EnvParams) -> dict[str, Array]:
-        ranges = self.true_ranges(own, sight, params)
-        directions = lidar.beam_directions(sight.heading, params.lidar.n_beams)
-        ranges = sight.spoil(jnp.minimum(ranges, sight.hits(directions)))
-        return {"ranges": lidar.add_noise(ranges, noise.normal, params.lidar)}
+        walls, n = self.true_ranges(own, sight, params), params.lidar.n_beams
+        directions = lidar.beam_directions(sight.heading, n)
+        things = sight.hits(directions)
+        ranges = sight.spoil(jnp.minimum(walls, things))
+        entries = {"ranges": lidar.add_noise(ranges, noise.normal[:n], params.lidar)}
+        if params.lidar.intensity:
+            ends = sight.position + walls[:, None] * directions
+            texture = 0.0 if params.lidar.texture is None else params.lidar.texture
+            factor, tangent = wall_brightness(sight.tunnel, sight.station, sight.position, ends, texture)
+            slant = jnp.abs(tangent[:, 0] * directions[:, 1] - tangent[:, 1] * directions[:, 0])
+            met = things < walls
+            reflectivity = jnp.where(met, echo.ALBEDO_THING, echo.ALBEDO_LINING * factor)
+            shown = intensity(jnp.where(met, 1.0, slant), reflectivity, noise.normal[n:])
+            entries["intensity"] = jnp.where(ranges < params.lidar.range_max, shown, 0.0)
+        return entries
 
     def true_ranges(self, own: Any, sight: Sight, params: EnvParams) -> Array:
         """Cast the beams against the walls, m."""
@@ -37,7 +50,10 @@ class PlanarLidar(Part):
 
     def space(self, params: EnvParams) -> dict[str, Bounds]:
         n_beams, range_max = params.lidar.n_beams, jnp.max(jnp.asarray(params.lidar.range_max))
-        return {"ranges": (np.zeros(n_beams), jnp.full(n_beams, range_max))}
+        entries: dict[str, Bounds] = {"ranges": (np.zeros(n_beams), jnp.full(n_beams, range_max))}
+        if params.lidar.intensity:
+            entries["intensity"] = (np.zeros(n_beams), np.full(n_beams, MOST))
+        return entries
 
     def skips_unwanted(self, params: EnvParams) -> bool:
         return lidar.skips_unwanted(params.lidar)

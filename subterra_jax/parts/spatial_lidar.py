@@ -14,6 +14,7 @@ from subterra_jax.lidar3d.casting import Met, meet, require_free, require_patter
 from subterra_jax.lidar3d.echo import EchoParams
 from subterra_jax.lidar3d.relief import Relief
 from subterra_jax.lidar3d.space import Mount, into_tunnel, stand
+from subterra_jax.parts.brightness import DOPPLER_MOST, DOPPLER_SIGMA, FULL_SCALE, MOST, intensity, wall_brightness
 from subterra_jax.parts.part import Bounds, Noise, Part, Sight, Step
 from subterra_jax.parts.unicycle import wrap
 from subterra_jax.state import EnvParams, State
@@ -34,6 +35,9 @@ class SpatialParams:
         shape: Rows and columns of the image; of a spinning sensor rings and azimuths.
         sweep: Cast each beam from the pose at its own time; otherwise all from that of the observation.
         intensity: Observe intensities too.
+        full_scale: Intensity reported for a diffuse surface of 100 %.
+        texture: Dial of the walls' texture, 0 to 1; `None` has none, and costs nothing.
+        doppler: Observe the speed of each beam's range over the last step, m/s; positive goes away.
     """
 
     directions: Float[Array, "n 3"]
@@ -45,6 +49,14 @@ class SpatialParams:
     shape: tuple[int, int] = struct.field(pytree_node=False, default=(1, 1))
     sweep: bool = struct.field(pytree_node=False, default=False)
     intensity: bool = struct.field(pytree_node=False, default=False)
+    full_scale: float = struct.field(pytree_node=False, default=FULL_SCALE)
+    texture: Float[Array, ""] | float | None = None
+    doppler: bool = struct.field(pytree_node=False, default=False)
+
+    @property
+    def remembers(self) -> bool:
+        """True where the pose before the step is needed."""
+        return self.sweep or self.doppler
 
     @property
     def n_beams(self) -> int:
@@ -112,13 +124,16 @@ def _spin16x64() -> SpatialParams:
 def _vlp16() -> SpatialParams:
     """Return Velodyne's VLP-16: 100 m on a target of 50 %; least range and divergence are near the manual's."""
     errors = EchoParams(weakest=0.5 / 100.0**2, divergence=1.5e-3)
-    return _spinning(_VLP16, 1800, 2.304e-6, _VLP16_FIRED, range_max=100.0, range_min=0.4, echo=errors)
+    return _spinning(
+        _VLP16, 1800, 2.304e-6, _VLP16_FIRED, range_max=100.0, range_min=0.4, echo=errors, full_scale=100.0
+    )
 
 
 def _os1() -> SpatialParams:
     """Return Ouster's OS1-64: 45 m on a target of 10 %; ring 0 looks up."""
     errors = EchoParams(weakest=0.1 / 45.0**2, divergence=1.6e-3)
-    return _spinning(np.deg2rad(np.linspace(22.5, -22.5, 64)), 1024, range_max=120.0, range_min=0.5, echo=errors)
+    rings = np.deg2rad(np.linspace(22.5, -22.5, 64))
+    return _spinning(rings, 1024, range_max=120.0, range_min=0.5, echo=errors, full_scale=100.0)
 
 
 def _avia() -> SpatialParams:
@@ -184,8 +199,8 @@ class SpatialLidar(Part):
         return {"lidar": make_sensor("spin16x64")}
 
     def normals(self, params: EnvParams) -> int:
-        """One for each beam, two with intensities."""
-        return params.lidar.n_beams * (1 + params.lidar.intensity)
+        """One for each beam and channel."""
+        return params.lidar.n_beams * (1 + params.lidar.intensity + params.lidar.doppler)
 
     def uniforms(self, params: EnvParams) -> int:
         """As many for each beam as its errors take."""
@@ -193,11 +208,11 @@ class SpatialLidar(Part):
 
     def begin(self, draw: Any, state: State, params: EnvParams) -> Any:
         """Stand still; nothing is kept without a sweep."""
-        return Sweeping(state.position, state.heading) if params.lidar.sweep else ()
+        return Sweeping(state.position, state.heading) if params.lidar.remembers else ()
 
     def advance(self, own: Any, step: Step, noise: Noise, params: EnvParams) -> Any:
         """Keep the pose before the step."""
-        return Sweeping(step.before.position, step.before.heading) if params.lidar.sweep else own
+        return Sweeping(step.before.position, step.before.heading) if params.lidar.remembers else own
 
     def poses(self, own: Any, sight: Sight, params: EnvParams) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
         """Return origin (m) and direction of each beam, tunnel frame."""
@@ -218,8 +233,8 @@ class SpatialLidar(Part):
     def relief(self, sight: Sight, params: EnvParams) -> Relief:
         return sight.tunnel.space.relief
 
-    def look(self, own: Any, sight: Sight, uniform: Any, params: EnvParams) -> tuple[Met, Array, Array]:
-        """Return the nearest surfaces, the cosines of incidence, and the rays.
+    def look(self, own: Any, sight: Sight, uniform: Any, params: EnvParams) -> tuple[Met, Array, Array, Array]:
+        """Return the nearest surfaces, the cosines of incidence, the rays, and their origins.
 
         Args:
             own: State of the part.
@@ -244,7 +259,7 @@ class SpatialLidar(Part):
             off = off - met.ranges[:n] * jnp.sum(normal * rays, axis=-1)
             mixed = echo.mix(met.ranges[:n], met.ranges[n:], off, uniform[:, :2], sensor.echo)
             met = met._replace(ranges=jnp.where(met.ranges[:n] < sensor.range_max, mixed, met.ranges[:n]))
-        return Met(met.ranges[:n], normal, met.thing[:n]), cosine, rays
+        return Met(met.ranges[:n], normal, met.thing[:n]), cosine, rays, origins[:n]
 
     def _meet(self, origins: Array, rays: Array, sight: Sight, params: EnvParams) -> Met:
         """Return what rays meet; those of one place as an image, which GPUs take column by column."""
@@ -256,27 +271,49 @@ class SpatialLidar(Part):
         return Met(*(part.reshape(len(rays), *part.shape[2:]) for part in image))
 
     def observe(self, own: Any, sight: Sight, noise: Noise, params: EnvParams) -> dict[str, Array]:
-        """Return `scan`, m, and with intensities `intensity`, 0 to 255, both row by row."""
+        """Return `scan`, m, and where asked `intensity`, 0 to 255, and `doppler`, m/s, row by row."""
         sensor, n = params.lidar, params.lidar.n_beams
         uniform = jnp.reshape(noise.uniform, (sensor.echo.n_uniform, n)).T if sensor.echo.n_uniform else None
-        met, cosine, rays = self.look(own, sight, None if uniform is None else uniform[:, sensor.echo.losing :], params)
+        met, cosine, rays, origins = self.look(
+            own, sight, None if uniform is None else uniform[:, sensor.echo.losing :], params
+        )
         ranges = sight.spoil(met.ranges)
         there = (ranges < sensor.range_max) & (ranges >= sensor.range_min)
         reflectivity = echo.albedo(met.normal[:, 2], met.thing, rays[:, 2] < 0.0)
+        if sensor.texture is not None:
+            ends = origins + met.ranges[:, None] * rays
+            factor, _ = wall_brightness(sight.tunnel, sight.station, sight.position, ends, sensor.texture)
+            reflectivity = jnp.where(met.thing, reflectivity, reflectivity * factor)
         if uniform is not None and sensor.echo.losing:
             there &= echo.returns(ranges, cosine, reflectivity, uniform[:, 0], sensor.echo)
         noisy = echo.add_noise(ranges, cosine, noise.normal[:n], sensor.echo)
         entries = {"scan": jnp.where(there, jnp.clip(noisy, 0.0, sensor.range_max), sensor.range_max)}
         if sensor.intensity:
-            entries["intensity"] = jnp.where(there, echo.intensity(cosine, reflectivity, noise.normal[n:]), 0.0)
+            shown = intensity(cosine, reflectivity, noise.normal[n : 2 * n], sensor.full_scale)
+            entries["intensity"] = jnp.where(there, shown, 0.0)
+        if sensor.doppler:
+            closing = jnp.sum(rays * self._velocity(own, sight, params), axis=-1)
+            speeds = DOPPLER_SIGMA * noise.normal[-n:] - closing
+            entries["doppler"] = jnp.where(there, jnp.clip(speeds, -DOPPLER_MOST, DOPPLER_MOST), 0.0)
         return entries
 
+    def _velocity(self, own: Sweeping, sight: Sight, params: EnvParams) -> Float[Array, "3"]:
+        """Return the sensor's mean velocity over the last step, tunnel frame, m/s; 0 at the start."""
+        mount, tunnel = params.lidar.mount, sight.tunnel
+        _, _, tangent_x, tangent_y, _ = at_station(tunnel, sight.station)
+        back = (own.position[0] - sight.position[0]) * tangent_x + (own.position[1] - sight.position[1]) * tangent_y
+        before, _ = stand(tunnel, own.position, own.heading, sight.station + back, mount)
+        now, _ = stand(tunnel, sight.position, sight.heading, sight.station, mount)
+        return (now - before) / jnp.asarray(params.vehicle.period)
+
     def space(self, params: EnvParams) -> dict[str, Bounds]:
-        """Return bounds from 0 to the largest range, and of intensities to 255."""
+        """Return bounds from 0 to the largest range, of intensities to 255, of speeds 20 m/s either way."""
         n, range_max = params.lidar.n_beams, jnp.max(jnp.asarray(params.lidar.range_max))
         entries: dict[str, Bounds] = {"scan": (np.zeros(n), jnp.full(n, range_max))}
         if params.lidar.intensity:
-            entries["intensity"] = (np.zeros(n), np.full(n, 255.0))
+            entries["intensity"] = (np.zeros(n), np.full(n, MOST))
+        if params.lidar.doppler:
+            entries["doppler"] = (np.full(n, -DOPPLER_MOST), np.full(n, DOPPLER_MOST))
         return entries
 
     def images(self, params: EnvParams) -> dict[str, tuple[int, int]]:

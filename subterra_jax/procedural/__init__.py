@@ -12,6 +12,7 @@ import numpy as np
 
 from subterra_jax.host.errors import TunnelError
 from subterra_jax.host.loading import load_module
+from subterra_jax.host.texture import texture_seed
 from subterra_jax.procedural import open_world
 from subterra_jax.procedural.geometry import Alignment
 from subterra_jax.tunnel.plan import Lining, TunnelPlan, Wall
@@ -93,4 +94,5 @@ def control() -> TunnelPlan:
         half_width=np.full(len(station), _HALF_WIDTH),
         lidar_height=_LIDAR_HEIGHT,
         linings={"smooth": Lining(left, right, np.zeros((0, 4)))},
+        texture=texture_seed(NAME),
     )

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from subterra_jax.host.errors import TunnelError
+from subterra_jax.host.texture import texture_seed
 from subterra_jax.procedural.bore import Bore, draw_bore
 from subterra_jax.procedural.cut import Cut, cut_lining, plane_walls
 from subterra_jax.procedural.geometry import Alignment, LineRanges, draw_alignment, wander
@@ -179,6 +180,7 @@ def plan(
         linings={variant: cut_lining(bore, alignment, variant, rough) for variant in variants},
         ring_pitch=0.0 if rings is None else rings.nominal,
         shell=make_shell(drawn.bore, alignment, drawn.grade, variants) if solid else None,
+        texture=texture_seed(name),
     )
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from subterra_jax.host.errors import TunnelError
+from subterra_jax.host.texture import texture_seed
 from subterra_jax.tunnel.distances import crossings, gaps_near
 from subterra_jax.tunnel.plan import Lining, TunnelPlan, Wall
 
@@ -217,6 +218,7 @@ def _bare_plan(
         lidar_height=float(_numbers("lidar_height", lidar_height, ())),
         linings={},
         ring_pitch=float(_numbers("ring_pitch", ring_pitch, ())),
+        texture=texture_seed(name),
     )
 
 

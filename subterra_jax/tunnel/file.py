@@ -100,6 +100,7 @@ def read_tunnel(path: Path) -> TunnelPlan:
         linings=_read_linings(fields),
         ring_pitch=ring_pitch,
         source=str(path),
+        texture=int(fields.number("texture")) if "texture" in fields.data else None,
     )
     if any(name.startswith("shell_") for name in fields.data):
         plan = dataclasses.replace(plan, shell=_read_shell(fields, plan))

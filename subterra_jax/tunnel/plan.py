@@ -62,6 +62,7 @@ class TunnelPlan:
             unknown. Pockets repeat with it.
         shell: The bore in three dimensions; `None` where it is not known.
         source: File that it was read from; empty if from none.
+        texture: Seed of the brightness of its walls; `None` where it is not known.
     """
 
     name: str
@@ -76,6 +77,7 @@ class TunnelPlan:
     ring_pitch: float = 0.0
     shell: Shell | None = None
     source: str = ""
+    texture: int | None = None
 
     @property
     def length(self) -> float:

@@ -18,6 +18,7 @@ import numpy as np
 
 from subterra_jax.host.errors import TunnelError
 from subterra_jax.host.files import cache_folder, make_writable, replace_file
+from subterra_jax.host.texture import texture_seed
 from subterra_jax.procedural import GENERATED, default_lining, expand, generate
 from subterra_jax.procedural import NAME as CONTROL
 from subterra_jax.procedural.open_world import in_benchmark
@@ -67,7 +68,8 @@ def load_tunnel(path: str | Path | None = None, *, solid: bool = False) -> Tunne
         if not file.exists() and Path(str(path)).parent == Path() and not Path(str(path)).suffix:
             by_name = f"{', '.join(PACKAGED)}, control, open:SPLIT:INDEX and open:KIND:SPLIT:INDEX"
             raise TunnelError(f"{path}: no such tunnel file; by name there are {by_name}")
-        return read_tunnel(file)
+        plan = read_tunnel(file)
+    return dataclasses.replace(plan, texture=texture_seed(plan.name)) if path is None or str(path) in PACKAGED else plan
 
 
 def tunnel_digest(path: str | Path | None = None) -> str:

@@ -38,6 +38,7 @@ class Tunnel:
         ring_pitch: Distance between ring joints, m; 0 without rings.
         first_node: Row of `grid` at station 0.
         n_nodes: Nodes of the station grid.
+        texture: Seed of the brightness of its walls, `(k,)` in a stack; -1 where it is not known.
         grid: Centreline x, y (m), unit tangent x, y and half width (m) at each node of the station grid.
         scan_first: First block of the window that a LiDAR near each node can see.
         contact_first: First block of the window that a robot near each node can touch.
@@ -63,6 +64,7 @@ class Tunnel:
     ring_pitch: Float[Array, "*k"]
     first_node: Int[Array, "*k"]
     n_nodes: Int[Array, "*k"]
+    texture: Int[Array, "*k"]
     grid: Float[Array, "all_nodes 5"]
     scan_first: Int[Array, "all_nodes"]
     contact_first: Int[Array, "all_nodes"]
@@ -92,7 +94,8 @@ class Tunnel:
         if self.count == 1:
             return self
         one = self._with_numbers(
-            self.length[index], self.spacing[index], self.ring_pitch[index], self.first_node[index], self.n_nodes[index]
+            *(numbers[index] for numbers in (self.length, self.spacing, self.ring_pitch)),
+            *(numbers[index] for numbers in (self.first_node, self.n_nodes, self.texture)),
         )
         return one if self.space is None else dataclasses.replace(one, space=self.space.pick(index))
 
@@ -103,12 +106,11 @@ class Tunnel:
         In a batch that picks different tunnels it is one for all.
         """
         bare = dataclasses.replace(self, space=None)
-        return bare._with_numbers(*(np.float32(0.0),) * 3, *(np.int32(0),) * 2)
+        return bare._with_numbers(*(np.float32(0.0),) * 3, *(np.int32(0),) * 3)
 
-    def _with_numbers(self, length: Any, spacing: Any, ring_pitch: Any, first_node: Any, n_nodes: Any) -> "Tunnel":
-        return dataclasses.replace(
-            self, length=length, spacing=spacing, ring_pitch=ring_pitch, first_node=first_node, n_nodes=n_nodes
-        )
+    def _with_numbers(self, *numbers: Any) -> "Tunnel":
+        names = ("length", "spacing", "ring_pitch", "first_node", "n_nodes", "texture")
+        return dataclasses.replace(self, **dict(zip(names, numbers, strict=True)))
 
     @classmethod
     def from_plan(
@@ -165,6 +167,7 @@ class Tunnel:
             ring_pitch=real(plan.ring_pitch),
             first_node=whole(0),
             n_nodes=whole(len(plan.station)),
+            texture=whole(-1 if plan.texture is None else plan.texture),
             grid=real(grid),
             scan_first=whole(scan_first + around[0]),
             contact_first=whole(contact_first + around[0]),
@@ -284,6 +287,7 @@ def stack(tunnels: Sequence[Tunnel]) -> Tunnel:
         ring_pitch=numbers("ring_pitch"),
         first_node=put(first_node),
         n_nodes=numbers("n_nodes"),
+        texture=numbers("texture"),
         grid=put(np.concatenate([np.asarray(t.grid) for t in tunnels])),
         scan_first=shifted("scan_first"),
         contact_first=shifted("contact_first"),

@@ -12,6 +12,7 @@ from subterra_jax.host.errors import SubterraError
 from subterra_jax.lidar3d import beams, echo
 from subterra_jax.lidar3d.space import Mount, into_tunnel, stand
 from subterra_jax.parts import make_sensor
+from subterra_jax.parts.brightness import intensity
 from subterra_jax.parts.spatial_lidar import SENSORS, Sweeping, along_arc
 from tests.subterra_jax import tunnels
 
@@ -200,7 +201,7 @@ def test_materials_are_told_apart_and_bright_when_met_squarely():
     )
     material = echo.albedo(normal_z, thing, below)
     np.testing.assert_allclose(material, [0.20, 0.30, 0.30, 0.36])
-    seen = echo.intensity(jnp.array([1.0, 0.5]), jnp.full(2, 0.3), jnp.zeros(2))
+    seen = intensity(jnp.array([1.0, 0.5]), jnp.full(2, 0.3), jnp.zeros(2))
     np.testing.assert_allclose(seen, [45.0, 22.5], rtol=1e-6)
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from subterra_jax.baselines.agent import Observed
 from subterra_jax.baselines.steering import Corridor
-from subterra_jax.policies.locate.profiles import Points
+from subterra_jax.policies.locate.profiles import Points, add_faces
 from subterra_jax.policies.locate.strips import sense
 
 _LENGTH = 4.0  # m of travel over which scans are averaged
@@ -37,7 +37,7 @@ def look(
     """
     points = sense(obs, walls, params)
     bend = follow(bend, points, moved)
-    return straighten(points, walls, bend), bend
+    return add_faces(straighten(points, walls, bend)), bend
 
 
 def follow(bend: Float[Array, ""], points: Points, moved: Float[Array, ""]) -> Float[Array, ""]:

@@ -7,6 +7,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from subterra_jax.baselines.steering import Corridor
 from subterra_jax.lidar import bearings
+from subterra_jax.lidar3d.echo import ALBEDO_LINING
+from subterra_jax.parts.brightness import FULL_SCALE
 
 BIN = 0.1  # m of a profile's bin
 BLOCK = 10  # bins of a block, over which evidence is summed
@@ -15,6 +17,7 @@ WINDOW = 288  # bins that a robot keeps
 N_BEARINGS = 7  # on either side: of 16 beams, those that are neither ahead nor behind
 ECHO = 1e-3  # m below `range_max`: no echo
 OUT = 1.5  # m; points further from the tracked wall than this are not of the wall
+_FACE = 0.1  # m of relief for a brightness of e: both channels are of one order
 _SPREAD = 2.0  # bins to either side over which a point counts, with falling weight
 
 Grid = Float[Array, "side 7 bins"]
@@ -32,6 +35,7 @@ class Points:
     out: Float[Array, "row 7"]  # distance beyond the tracked wall, m
     seen: Bool[Array, "row 7"]  # true where there is a point
     rays: int = struct.field(pytree_node=False, default=1)  # rows of points that belong to one side
+    face: Float[Array, "row 7"] | None = None  # logarithm of the brightness, about that of a bare lining
 
     @property
     def n_sides(self) -> int:
@@ -47,7 +51,26 @@ class Profiles:
     along: Grid  # weighted sum of distances ahead at which they were seen, m
 
 
-def find_points(ranges: Float[Array, "n_beams"], walls: Corridor, range_max: Float[Array, ""] | float) -> Points:
+def log_brightness(intensity: Array, incidence: Array, full_scale: float = FULL_SCALE) -> Array:
+    """Returns the logarithm of how bright the wall is beside a bare lining, from intensity and cosine of incidence."""
+    return jnp.log(jnp.maximum(intensity, 1.0) / (full_scale * ALBEDO_LINING * jnp.maximum(incidence, 0.05)))
+
+
+def add_faces(points: Points) -> Points:
+    """Returns points with brightness as further sides of the wall, which the same front end matches."""
+    if points.face is None:
+        return points
+    twice = lambda one, two: jnp.concatenate([one, two], axis=-2)  # noqa: E731
+    out, along = twice(points.out, _FACE * points.face), twice(points.along, points.along)
+    return Points(along, out, twice(points.seen, points.seen), points.rays)
+
+
+def find_points(
+    ranges: Float[Array, "n_beams"],
+    walls: Corridor,
+    range_max: Float[Array, ""] | float,
+    intensity: Float[Array, "n_beams"] | None = None,
+) -> Points:
     """Returns the points of a scan on either wall; of more than 16 beams, those at the bearings of 16."""
     n, every = ranges.shape[0], ranges.shape[0] // 16
     left = every * np.arange(1, N_BEARINGS + 1)
@@ -57,7 +80,8 @@ def find_points(ranges: Float[Array, "n_beams"], walls: Corridor, range_max: Flo
     along, across = reach * jnp.cos(angle), reach * jnp.abs(jnp.sin(angle))
     out = across - jnp.stack([walls.left, walls.right])[:, None]
     seen = (reach < range_max - ECHO) & (jnp.abs(along) < REACH) & (jnp.abs(out) < OUT)
-    return Points(along, out, seen)
+    face = None if intensity is None else log_brightness(intensity[chosen], jnp.abs(jnp.sin(angle)))
+    return Points(along, out, seen, face=face)
 
 
 def blank(n_bins: int, n_sides: int) -> Profiles:

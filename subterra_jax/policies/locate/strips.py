@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from subterra_jax.baselines.agent import Observed
+from subterra_jax.baselines.agent import LIDAR_ENTRIES, Observed, level_intensity
 from subterra_jax.baselines.steering import Corridor
 from subterra_jax.lidar3d.beams import N_LEVEL
-from subterra_jax.policies.locate.profiles import ECHO, N_BEARINGS, OUT, REACH, Points, find_points
+from subterra_jax.policies.locate.profiles import ECHO, N_BEARINGS, OUT, REACH, Points, find_points, log_brightness
 
 # m above the sensor: where rings of ± 1, 3 and 5° meet a wall 2.7 m away, 22.5° from ahead.
 HEIGHTS = (0.12, -0.12, 0.37, -0.37, 0.62, -0.62)
@@ -24,13 +24,14 @@ _OFF = 0.15  # m by which a return may be off a strip's height: rings are 0.25 m
 def sense(obs: Observed, walls: Corridor, params: Any) -> Points:
     """Returns the points of an observation on the walls: of level ranges, or of an image of rings and columns."""
     if not is_spinning(params.lidar):
-        return find_points(obs.ranges, walls, params.lidar.range_max)
-    return _find_strips(obs.entries["scan"].reshape(params.lidar.shape), walls, params.lidar)
+        return find_points(obs.ranges, walls, params.lidar.range_max, level_intensity(obs, params))
+    entries = {name: obs.entries[name].reshape(params.lidar.shape) for name in LIDAR_ENTRIES & set(obs.entries)}
+    return _find_strips(entries["scan"], walls, params.lidar, entries.get("intensity"))
 
 
 def n_sides(lidar: Any) -> int:
     """Returns the number of sides that the points of a LiDAR are of."""
-    return 2 * len(HEIGHTS) if is_spinning(lidar) else 2
+    return (2 * len(HEIGHTS) if is_spinning(lidar) else 2) * (1 + lidar.intensity)
 
 
 def is_spinning(lidar: Any) -> bool:
@@ -39,7 +40,12 @@ def is_spinning(lidar: Any) -> bool:
     return rings > 1 and columns % N_LEVEL == 0 and columns // N_LEVEL >= RAYS
 
 
-def _find_strips(image: Float[Array, "ring column"], walls: Corridor, sensor: Any) -> Points:
+def _find_strips(
+    image: Float[Array, "ring column"],
+    walls: Corridor,
+    sensor: Any,
+    intensity: Float[Array, "ring column"] | None = None,
+) -> Points:
     """Returns the return of the ring that looks nearest to each strip's height, by bearing and column."""
     n_rings, n_columns = image.shape
     direction = jnp.asarray(sensor.directions).reshape(n_rings, n_columns, 3)
@@ -60,4 +66,8 @@ def _find_strips(image: Float[Array, "ring column"], walls: Corridor, sensor: An
     seen = (reach < sensor.range_max - ECHO) & (jnp.abs(along) < REACH) & (jnp.abs(out) < OUT)
     seen &= jnp.abs(reach * jnp.sin(elevation[ring]) - height) < _OFF
     rows = lambda values: values.reshape(-1, N_BEARINGS)  # noqa: E731
-    return Points(rows(along), rows(out), rows(seen), rays=RAYS)
+    face = None
+    if intensity is not None:
+        incidence = sine * jnp.cos(elevation[ring])
+        face = rows(log_brightness(intensity[ring, column], incidence, sensor.full_scale))
+    return Points(rows(along), rows(out), rows(seen), RAYS, face)

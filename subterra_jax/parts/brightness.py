@@ -1,0 +1,62 @@
+"""How bright the wall is where beams end, and how fast it comes nearer: what intensity and Doppler channels show."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from subterra_jax import constants
+from subterra_jax.host.texture import brightness, wall_angle
+from subterra_jax.tunnel import Tunnel, at_station, node_at
+
+FULL_SCALE, SCALE_SIGMA = 150.0, 0.05  # reported for 100 % diffuse, as Livox scales it; relative noise
+MOST = 255.0
+DOPPLER_SIGMA = 0.03  # m/s. Source: Aeva's Aeries II, 3 cm/s
+DOPPLER_MOST = 20.0  # m/s
+
+
+def wall_brightness(
+    tunnel: Tunnel,
+    station: Float[Array, ""],
+    position: Float[Array, "2"],
+    ends: Float[Array, "n d"],
+    texture: Float[Array, ""] | float,
+) -> tuple[Float[Array, "n"], Float[Array, "n 2"]]:
+    """Return factors on the reflectivity of the lining where beams end, and the tangent of the axis there.
+
+    Args:
+        tunnel: The tunnel.
+        station: Station of the sensor, m.
+        position: Its position in plan, tunnel frame, m.
+        ends: Ends of the beams, tunnel frame, m; in plan those of a planar LiDAR.
+        texture: Dial, 0 to 1.
+    """
+    _, _, tangent_x, tangent_y, _ = at_station(tunnel, station)
+    near = station + (ends[:, 0] - position[0]) * tangent_x + (ends[:, 1] - position[1]) * tangent_y
+    node = jax.vmap(node_at, (None, 0))(tunnel, near)
+    row = tunnel.grid[node]
+    away, tangent = ends[:, :2] - row[:, :2], row[:, 2:4]
+    ahead = away[:, 0] * tangent[:, 0] + away[:, 1] * tangent[:, 1]
+    left = tangent[:, 0] * away[:, 1] - tangent[:, 1] * away[:, 0]
+    above: Any = constants.SPATIAL_HEIGHT
+    if ends.shape[1] == 3:
+        ground = tunnel.space.ground[node]
+        above = ends[:, 2] - ground[:, 0] - ground[:, 1] * ahead
+    at = tunnel.spacing * (node - tunnel.first_node).astype(ahead.dtype) + ahead
+    return brightness(jnp, at, wall_angle(jnp, left, above), tunnel.texture, texture), tangent
+
+
+def intensity(
+    cosine: Float[Array, "n"], reflectivity: Float[Array, "n"], normal: Float[Array, "n"], full: float = FULL_SCALE
+) -> Float[Array, "n"]:
+    """Return reported intensities, whole numbers up to 255, with 5 % noise.
+
+    Args:
+        cosine: Cosine of incidence, 0 to 1.
+        reflectivity: Reflectivity of what is met.
+        normal: Standard normal numbers.
+        full: Reported for 100 % diffuse.
+    """
+    value: Any = full * reflectivity * cosine * (1.0 + SCALE_SIGMA * normal)
+    return jnp.clip(jnp.round(value), 0.0, MOST)

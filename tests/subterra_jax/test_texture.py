@@ -1,0 +1,144 @@
+"""Walls with a face: brightness fixed to the wall, intensities and Doppler of the batch."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import subterra_jax as st
+from subterra_jax.host.errors import TunnelError
+from subterra_jax.host.texture import RING, brightness, texture_seed, wall_angle
+
+TASK, HALF = "Subterra/TraverseShort-v1", 2.8
+
+
+def straight(**changes):
+    station = np.linspace(0.0, 40.0, 81)
+    plan = st.tunnel.from_centreline(np.stack([station, np.zeros(81)], axis=-1), HALF, lidar_height=0.7)
+    return dataclasses.replace(plan, **changes)
+
+
+def some_places(n=4000):
+    rng = np.random.default_rng(0)
+    return rng.uniform(0.0, 300.0, n).astype(np.float32), rng.uniform(-np.pi, np.pi, n).astype(np.float32)
+
+
+def test_a_wall_is_equally_bright_for_numpy_and_jax_and_plain_at_dial_0():
+    places = some_places()
+    seen = brightness(np, *places, 7, 1.0)
+    np.testing.assert_allclose(jax.jit(lambda s, a: brightness(jnp, s, a, jnp.int32(7), 1.0))(*places), seen, rtol=1e-4)
+    assert 0.2 < np.log(seen).std() < 0.35
+    assert np.log(seen).max() < 1.2
+    assert (brightness(np, *places, 7, 0.0) == 1.0).all()
+    half = np.log(brightness(np, *places, 7, 0.5))
+    np.testing.assert_allclose(half, 0.5 * np.log(seen), atol=1e-5)
+    assert abs(np.corrcoef(seen, brightness(np, *places, 8, 1.0))[0, 1]) < 0.05
+
+
+def test_neighbours_are_alike_also_across_the_seam_and_joints_are_dark():
+    station, angle = some_places()
+    far = np.log(brightness(np, station, angle, 7, 1.0))
+    likeness = [np.corrcoef(far, np.log(brightness(np, station + d, angle, 7, 1.0)))[0, 1] for d in (0.05, 0.3, 1.0)]
+    assert likeness[0] > 0.8 > 0.5 > likeness[1] > 0.2 > likeness[2] > 0.02
+    sides = [np.log(brightness(np, station, np.full_like(station, a), 7, 1.0)) for a in (np.pi - 1e-4, 1e-4 - np.pi)]
+    assert np.corrcoef(*sides)[0, 1] > 0.8
+    joint = RING * np.floor(station / RING)
+    assert far.mean() - np.log(brightness(np, joint, angle, 7, 1.0)).mean() > 0.3
+    np.testing.assert_allclose(wall_angle(np, np.array([0.0, 2.0, -2.0]), 1.5), [0.0, np.pi / 2, -np.pi / 2])
+
+
+def placed(env, params, x, y=0.0, heading=0.0):
+    _, state = env.reset(jax.random.key(0), params)
+    number = jnp.float32
+    return dataclasses.replace(
+        state, position=jnp.array([x, y], number), heading=number(heading), station=number(x), lateral=number(y)
+    )
+
+
+def observe(env, state, params, key=1):
+    flat = jax.jit(env.observe)(state, env.draw_step(jax.random.key(key), (), params), params)
+    return {name: np.asarray(flat[at]) for name, at in env.fields(params).items()}
+
+
+def test_planar_intensities_are_those_of_the_wall_and_a_pose_moves_none_of_it():
+    env, params = st.make(TASK, tunnel=straight(), intensity=True, texture=1.0)
+    seen = observe(env, placed(env, params, 15.0, 0.4, 0.3), params)
+    assert seen["intensity"].shape == (16,)
+    assert (seen["intensity"] == np.round(seen["intensity"])).all()
+    bearing = 0.3 + 2.0 * np.pi * np.arange(16) / 16
+    reach = np.where(np.sin(bearing) > 0.0, HALF - 0.4, HALF + 0.4) / np.abs(np.sin(bearing))
+    station, left = 15.0 + reach * np.cos(bearing), np.sign(np.sin(bearing)) * HALF
+    factor = brightness(np, station, wall_angle(np, left, np.full(16, 0.7)), texture_seed(straight().name), 1.0)
+    met = (station > 0.5) & (station < 39.5)
+    expected = 150.0 * 0.3 * np.abs(np.sin(bearing)) * factor
+    assert (np.abs(seen["intensity"] - expected)[met] < 0.2 * expected[met] + 1.5).all()
+    assert np.corrcoef(seen["intensity"][met], expected[met])[0, 1] > 0.97
+
+
+@pytest.fixture(scope="module")
+def images():
+    """By dial, images of two sweeps 0.5 m apart, unrolled in 5 cm cells, freed of what a plain wall shows."""
+    made = {}
+    for dial in (0.0, 0.5, 1.0):
+        env, params = st.make(TASK, tunnel=straight(), sensor="vlp16", intensity=True, texture=dial)
+        rays = np.asarray(params.lidar.directions, np.float64)
+        pair = []
+        for key, x in enumerate((15.0, 15.5)):
+            seen = observe(env, placed(env, params, x), params, key)
+            points = rays * seen["scan"][:, None] + (x, 0.0, 0.7)
+            near = (seen["intensity"] > 0.0) & (np.abs(points[:, 0] - x) < 3.0) & (np.abs(points[:, 2] - 1.1) < 0.9)
+            near &= np.abs(points[:, 1]) > HALF - 0.1  # the walls stand upright
+            pair.append(unroll(points[near], seen["intensity"][near] / np.abs(rays[near, 1])))
+        made[dial] = pair
+    return made
+
+
+def unroll(points, value):
+    cell = np.floor(points[:, [0, 2]] / 0.05).astype(int) * (1, 2) + np.stack([points[:, 1] * 0, points[:, 1] > 0], 1)
+    keys, where = np.unique(cell.astype(int), axis=0, return_inverse=True)
+    return dict(
+        zip(map(tuple, keys.tolist()), np.bincount(where.ravel(), value) / np.bincount(where.ravel()), strict=True)
+    )
+
+
+def test_two_sweeps_have_the_wall_in_common_by_the_dial(images):
+    found = []
+    for one, other in images.values():
+        both = sorted(one.keys() & other.keys())
+        assert len(both) > 500
+        found.append(np.corrcoef([one[k] for k in both], [other[k] for k in both])[0, 1])
+    print("correlation by dial", dict(zip(images, np.round(found, 3), strict=True)))
+    assert found[0] <= 0.05
+    assert found[2] >= 0.6
+    assert found[0] < found[1] < found[2]
+
+
+def test_doppler_is_the_speed_of_each_range():
+    env, params = st.make(TASK, tunnel=straight(), sensor="spin16x64", doppler=True)
+    state = placed(env, params, 15.0, 0.3, 0.2)
+    drawn = env.draw_step(jax.random.key(1), (), params)
+    state, *_ = env.advance(state, jnp.array([1.5, 0.0]), drawn, params)
+    seen = observe(env, state, params)
+    cos, sin = np.cos(0.2), np.sin(0.2)
+    rays = np.asarray(params.lidar.directions)
+    speed = float(np.hypot(*(np.asarray(state.position) - (15.0, 0.3)))) / float(params.vehicle.period)
+    back = seen["scan"] < 30.0
+    assert speed > 0.5
+    assert cos > sin
+    error = seen["doppler"][back] + speed * rays[back, 0]
+    assert abs(error.mean()) < 0.01
+    assert 0.02 < error.std() < 0.04
+    assert (seen["doppler"][~back] == 0.0).all()
+
+
+def test_wrong_wishes_are_refused_in_one_sentence():
+    with pytest.raises(ValueError, match="between 0 and 1, got"):
+        st.make(TASK, tunnel=straight(), intensity=True, texture=1.5)
+    with pytest.raises(TunnelError, match="no field 'texture'"):
+        st.make(TASK, tunnel=straight(texture=None), intensity=True, texture=0.5)
+    with pytest.raises(ValueError, match="Doppler"):
+        st.make(TASK, tunnel=straight(), doppler=True)
+    env, params = st.make(TASK, tunnel=straight(texture=None), intensity=True)
+    assert env.fields(params)["intensity"].stop - env.fields(params)["intensity"].start == 16
