@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from subterra_jax.batch import AutoReset, rollout
     from subterra_jax.compiled import cache_programs
     from subterra_jax.env import Env
+    from subterra_jax.evaluation.localisability import localisability
     from subterra_jax.policies import load_policy
     from subterra_jax.randomization import LogUniform, randomize
     from subterra_jax.state import EnvParams, State
@@ -43,6 +44,7 @@ _HOMES = {
     "TunnelEnv": "tunnel_env",
     "TunnelPlan": "tunnel.plan",
     "load_policy": "policies",
+    "localisability": "evaluation.localisability",
     "load_tunnel": "tunnel.sources",
     "make": "tasks",
     "randomize": "randomization",

@@ -17,14 +17,15 @@ from jaxtyping import Float
 
 from benchmarks.command import BenchmarkError, require_least
 from benchmarks.results import environment_facts, write_file
-from benchmarks.slam.arena.record import Scene
+from benchmarks.slam.arena.record import Scene, face_of
 from benchmarks.slam.arena.sets import redraw
-from benchmarks.slam.programs import PROGRAMS, WHEELS, find_program
-from benchmarks.slam.reading import ODOMETRY, TRUTH, TRUTH_FILE, check_recording, recordings_in
+from benchmarks.slam.programs import DOPPLER, PROGRAMS, WHEELS, find_program
+from benchmarks.slam.reading import ODOMETRY, TRUTH, TRUTH_FILE, check_recording, measures_speed, recordings_in
 from benchmarks.slam.score import LEAST_COVERED, score_files
 from scene.survey.carrier import rotate
-from scene.survey.cast import Caster, draw_returns, noise_sigma
+from scene.survey.cast import ALBEDO, REFLECTIVITY_NOISE, Caster, Face, Hits, draw_returns, noise_sigma
 from scene.survey.config import SensorErrors
+from subterra_jax.evaluation.localisability import LEAST_SLOPE, PLACES, fit_slopes
 from subterra_jax.host.files import replace_file
 
 SCHEMA = "subterra.arena-board/2"
@@ -142,8 +143,9 @@ def plan_board(config: BoardConfig) -> list[Case]:
     for folder in config.sets:
         for recording in recordings_in(folder):
             place = config.out / "poses" / folder.name
-            cases += [Case(program, recording, place / program) for program in config.programs]
-            if not cases[-1].truth.is_file():
+            some = config.programs if measures_speed(recording) else [one for one in config.programs if one != DOPPLER]
+            cases += [Case(program, recording, place / program) for program in some]
+            if cases and not cases[-1].truth.is_file():
                 raise BenchmarkError(f"{folder}: holds no truth of {recording.name}")
     for recording in {one.recording for one in cases if config.run and not one.facts.is_file()}:
         check_recording(recording)  # a damaged bag is no failure of a program
@@ -209,7 +211,7 @@ def _floor(folder: Path, name: str, kept: Path) -> dict[str, Any]:
     return {"set": folder.name, "recording": name, **json.loads(kept.read_text())}
 
 
-# Floor of the axial drift: what the ranges of a drive could tell about the way, whatever program reads them.
+# Floor of the axial drift: what ranges and brightness of a drive could tell about the way, whatever program reads them.
 #
 # A beam's slope over the station is that of the best line through its ranges from stations about the true one
 # (statistical linearisation); what the line leaves over counts as noise.
@@ -218,9 +220,6 @@ def _floor(folder: Path, name: str, kept: Path) -> dict[str, Any]:
 # σ₁ · sqrt(2 / n) · sqrt(d / ℓ), with n sweeps to a view length.
 #
 # Slopes below `LEAST_SLOPE` count as none: no program knows a wall to the millimetre before it has driven past.
-LEAST_SLOPE = 0.005  # 1
-_BLUR = 0.05  # m, spread of the stations about the true one
-_PLACES = np.array([-1.6, -0.8, 0.0, 0.8, 1.6]) * _BLUR  # m; standard deviation 1.13 times the blur
 _SWEEPS = 12  # sweeps of a drive that are looked at
 
 
@@ -245,6 +244,12 @@ def find_floor(scene: Scene) -> Floor:
     return Floor(sweep, view, sweep * np.sqrt(2.0 / sweeps) * np.sqrt(100.0 / view))
 
 
+def _brightness(face: Face, station: float, origin: np.ndarray, heading: np.ndarray, hits: Hits) -> np.ndarray:
+    """Returns the reflectivity that each beam would report without noise, 1."""
+    ends = origin + np.where(np.isfinite(hits.distance), hits.distance, 0.0)[:, None] * heading
+    return face(station, ends, hits.part) * ALBEDO[hits.part] * hits.cosine
+
+
 def _sweep_bound(
     rng: np.random.Generator, scene: Scene, caster: Caster, rays: Float[np.ndarray, "n 3"], time: float
 ) -> tuple[float, float]:
@@ -255,20 +260,19 @@ def _sweep_bound(
     heading = rotate(np.repeat(poses.quaternion, len(rays), axis=0), rays)
     caster.load(float(scene.drive.station(at)[0]), poses.position[0])
     casts = [caster.cast_loaded(np.repeat(poses.position + shift * tangent, len(rays), axis=0), heading)
-             for shift in _PLACES]  # fmt: skip
+             for shift in PLACES]  # fmt: skip
     ranges = np.stack([one.distance for one in casts]).astype(np.float64)
     hits = casts[len(casts) // 2]
     seen = draw_returns(rng, scene.sensor.lidar, SensorErrors(), hits) & np.isfinite(ranges).all(axis=0)
     slope, left = fit_slopes(ranges[:, seen])
     noise = noise_sigma(SensorErrors(), hits.distance[seen], hits.cosine[seen])
     information = np.sum(np.where(abs(slope) < LEAST_SLOPE, 0.0, slope**2 / (noise**2 + left)))
+    if (face := face_of(scene)) is not None:
+        at_once = zip(PLACES, casts, strict=True)
+        station = float(scene.drive.station(at)[0])
+        shown = np.stack([_brightness(face, station, poses.position + x * tangent, heading, one) for x, one in at_once])
+        slope, left = fit_slopes(shown[:, seen])
+        information += np.sum(slope**2 / (REFLECTIVITY_NOISE**2 * shown.mean(axis=0)[seen] ** 2 + left))
     along = (heading[seen] @ tangent) * hits.distance[seen]
     view = float(np.ptp(np.quantile(along, [0.05, 0.95])))
     return float(1.0 / np.sqrt(max(information, 1e-12))), view
-
-
-def fit_slopes(ranges: Float[np.ndarray, "k n"]) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-    """Returns the slope of each beam's range over the station and the variance about the line, m²."""
-    middle = ranges - ranges.mean(axis=0)
-    slope = _PLACES @ middle / (_PLACES @ _PLACES)
-    return slope, np.mean((middle - np.outer(_PLACES, slope)) ** 2, axis=0)

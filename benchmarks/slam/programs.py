@@ -1,4 +1,4 @@
-"""Programs for SLAM, with their own defaults and one thread: `evalio`'s and `rko-lio`.
+"""Programs for SLAM, with their own defaults and one thread: `evalio`'s, `rko-lio` and ours.
 
 `main` runs one in this process: it reads the bag, feeds sweeps and IMU samples in order, writes the LiDAR's poses and
 prints one line of JSON. The libraries are optional (`pip install 'subterra-jax[slam]'`).
@@ -18,10 +18,11 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from benchmarks.command import BenchmarkError
+from benchmarks.slam import odometry
 from benchmarks.slam.reading import CALIBRATION, Poses, read_samples
 from scene.poses.trajectory import Trajectory, save_tum
 
-WHEELS = "wheel-odometry"
+WHEELS, DOPPLER = "wheel-odometry", "doppler-odometry"
 # What is not left at a program's defaults: sums of several threads differ from run to run; points are undistorted by
 # their times, which evalio leaves out; no sweep is skipped to keep up with real time.
 _CHANGES = {"max_num_threads": 1, "num_threads": 1, "ls_num_threads": 1, "numberOfCores": 1, "deskew": True,
@@ -84,6 +85,8 @@ PROGRAMS = {
     **{f"evalio-{name}": Program("evalio", partial(_run_evalio, name))
        for name in ("kiss", "genz", "mad", "ct", "loam", "liosam", "dlio", "form")},
     "rko-lio": Program("rko-lio", _run_rko),
+    "intensity-odometry": Program("subterra-jax", partial(odometry.run, odometry.by_brightness)),
+    DOPPLER: Program("subterra-jax", partial(odometry.run, odometry.by_doppler)),
 }  # fmt: skip
 
 

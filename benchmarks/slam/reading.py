@@ -17,9 +17,10 @@ RECORDINGS, TRUTH, INDEX = "recordings", "truth", "set.json"  # folders and file
 CALIBRATION, TRUTH_FILE, ODOMETRY = "calibration.yaml", "lidar.tum", "odometry.tum"
 
 Poses = tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 4 4"], float]  # times, s; LiDAR poses; run time, s
-# One layout for all drivers: m, reflectivity or intensity as reported, ns after the header's stamp, line.
+# One layout for all drivers: m, reflectivity or intensity as reported, ns after the header's stamp, line, m/s or NaN.
 POINT = np.dtype([
     ("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("t", "<u4"), ("ring", "<u2"),
+    ("velocity", "<f4"),
 ])  # fmt: skip
 _KINDS = {2: "u1", 4: "<u2", 6: "<u4", 7: "<f4", 8: "<f8"}
 _TIMES = {"time": 1e9, "t": 1.0}  # field of Velodyne's and Ouster's drivers, and its unit in ns
@@ -64,6 +65,12 @@ def check_recording(recording: Path) -> None:
             raise BenchmarkError(f"{recording / 'recording'}: has no topic {topic}; it has {', '.join(sorted(held))}")
 
 
+def measures_speed(recording: Path) -> bool:
+    """Tells whether the LiDAR of a recording measures the speed of each range."""
+    path = recording / CALIBRATION
+    return path.is_file() and bool(yaml.safe_load(path.read_text())["lidar"].get("doppler"))
+
+
 def _open_bag(folder: Path) -> Any:
     if not (folder / "metadata.yaml").is_file():
         ros1 = folder.with_suffix(".bag").is_file()
@@ -86,7 +93,7 @@ def sweep_points(message: Any) -> np.ndarray:
         ValueError: The cloud has no time of its points.
     """
     if hasattr(message, "point_num"):
-        rows = [(p.x, p.y, p.z, p.reflectivity, p.offset_time, p.line) for p in message.points]
+        rows = [(p.x, p.y, p.z, p.reflectivity, p.offset_time, p.line, np.nan) for p in message.points]
         return np.array(rows, POINT)
     fields = {field.name: field for field in message.fields}
     names = list(fields)
@@ -99,8 +106,10 @@ def sweep_points(message: Any) -> np.ndarray:
     if time is None:
         raise ValueError(f"its points have no time; they have {', '.join(names)}")
     points = np.zeros(len(raw), POINT)
-    for name in ("x", "y", "z", "intensity", "ring"):
+    for name in ("x", "y", "z", "ring"):
         points[name] = raw[name]
+    points["intensity"] = raw["reflectivity" if "reflectivity" in fields else "intensity"]  # which no range weakens
+    points["velocity"] = raw["velocity"] if "velocity" in fields else np.nan
     points["t"] = np.rint(_TIMES[time] * raw[time].astype(np.float64))
     return points
 
@@ -115,8 +124,9 @@ def livox_points(raw: bytes) -> tuple[int, np.ndarray]:
     count = int(np.frombuffer(raw, "<u4", 1, begin + 16)[0])
     rows = np.frombuffer(bytes(raw[begin + 20 :]) + b"\0", _LIVOX_CDR, count)
     points = np.zeros(count, POINT)
-    for name in POINT.names or ():
+    for name in _LIVOX_CDR.names or ():
         points[name] = rows[name]
+    points["velocity"] = np.nan
     return seconds * 1_000_000_000 + rest, points
 
 

@@ -71,6 +71,7 @@ class Caster:
 
 
 FADING = 0.5  # standard deviation of the logarithm of the echo (speckle)
+REFLECTIVITY_NOISE = 0.05  # of a reported reflectivity
 STEEPEST = 10.0  # tangent of the incidence angle beyond which the noise grows no more
 EDGE_STEP = 0.03  # m between two surfaces from which on they make an edge
 PULSE = 0.75  # m: echoes further apart in range are told apart by the receiver; half a pulse of 5 ns
@@ -181,7 +182,9 @@ def draw_reflectivity(
     rng: np.random.Generator, cosine: Float32[np.ndarray, "n"], part: UInt8[np.ndarray, "n"], factor: Any = 1.0
 ) -> UInt8[np.ndarray, "n"]:
     """Draws reported reflectivity: 0 to 150 for 0 to 100 % diffuse, as Livox scales it, with 5 % noise."""
-    value = 150.0 * factor * ALBEDO[part] * cosine * (1.0 + 0.05 * rng.standard_normal(len(part), np.float32))
+    value = (
+        150.0 * factor * ALBEDO[part] * cosine * (1.0 + REFLECTIVITY_NOISE * rng.standard_normal(len(part), np.float32))
+    )
     return np.clip(np.rint(value), 0, 255).astype(np.uint8)
 
 

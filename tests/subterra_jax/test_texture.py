@@ -142,3 +142,35 @@ def test_wrong_wishes_are_refused_in_one_sentence():
         st.make(TASK, tunnel=straight(), doppler=True)
     env, params = st.make(TASK, tunnel=straight(texture=None), intensity=True)
     assert env.fields(params)["intensity"].stop - env.fields(params)["intensity"].start == 16
+
+
+def test_a_bound_of_the_station_is_that_of_a_numeric_reference():
+    taper, station = 0.02, np.linspace(0.0, 40.0, 81)
+    xy = np.stack([station, np.zeros(81)], axis=-1)
+    plan = st.tunnel.from_centreline(xy, HALF + taper * station, lidar_height=0.7)
+    env, params = st.make(TASK, tunnel=plan, intensity=True, texture=1.0)
+    found = st.localisability(env, params, step=4.0)
+    at = np.flatnonzero(found.station == 18.0)[0]
+    bearing = 2.0 * np.pi * np.array([k for k in range(16) if k not in (0, 8)]) / 16
+    side, places = np.sign(np.sin(bearing)), np.linspace(-0.08, 0.08, 5)
+
+    def look(x):
+        reach = (HALF + taper * x) / (np.abs(np.sin(bearing)) - taper * np.cos(bearing))
+        where = x + reach * np.cos(bearing)
+        angle = wall_angle(np, side * (HALF + taper * where), np.full(14, 0.7))
+        slant = np.abs(np.sin(bearing))
+        return reach, np.round(45.0 * slant * brightness(np, where, angle, texture_seed(plan.name), 1.0))
+
+    ranges, shown = (np.array(rows) for rows in zip(*(look(18.0 + p) for p in places), strict=True))
+    expected = 0.0
+    for values, noise in ((ranges, 0.05**2), (shown, (0.05 * shown.mean(axis=0)) ** 2 + 1.0 / 12.0)):
+        slope, level = np.polyfit(places, values, 1)
+        expected = expected + np.sum(
+            slope**2 / (noise + np.mean((values - level - np.outer(places, slope)) ** 2, axis=0))
+        )
+        if values is ranges:
+            assert found.by_range[at] == pytest.approx(expected**-0.5, rel=0.02)
+    assert found.bound[at] == pytest.approx(expected**-0.5, rel=0.15)  # a rounded brightness may fall to either side
+    plain = st.localisability(*st.make(TASK, tunnel=straight(), intensity=True), step=20.0)
+    assert np.isinf(plain.by_range[0])
+    assert np.isinf(plain.bound[0])

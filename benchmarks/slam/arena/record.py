@@ -17,7 +17,7 @@ from benchmarks.slam.arena.drives import REST, WHEEL_RATE, Drive, MotionName, dr
 from benchmarks.slam.arena.walls import WallName, draw_walls
 from scene.survey import carrier, messages
 from scene.survey.carrier import Carried, Mount, Poses
-from scene.survey.cast import Caster, Hits, sweeps
+from scene.survey.cast import Caster, Face, Hits, sweeps
 from scene.survey.config import SensorErrors
 from scene.survey.lidar import Lidar, Sweep, avia, os1, vlp16
 from scene.survey.mesh import Part
@@ -70,6 +70,8 @@ class Course:
     motion: MotionName = "trolley"  # Way of carrying it
     dust: float = 0.0  # Density of the dust that moves with it; 0 is none, 1 full
     distance: float = 60.0  # Length of the way, m
+    texture: float = 0.0  # Brightness of the lining; from 0, all alike, to 1
+    doppler: bool = False  # The LiDAR measures the speed of each range too
 
 
 @dataclass(frozen=True)
@@ -84,12 +86,20 @@ class Scene:
 
 def draw_scene(course: Course, seed: np.random.SeedSequence) -> Scene:
     """Draws bore, drive and noise of a course."""
-    names = ("walls", "drive", "dust", "lidar", "imu", "wheels")
+    names = ("walls", "drive", "dust", "lidar", "imu", "wheels", "texture")
     seeds = dict(zip(names, seed.spawn(len(names)), strict=True))
     sensor = make_sensor(course.sensor)
     bore = draw_walls(seeds["walls"], course.walls, _BEHIND + course.distance + sensor.ahead)
     drive = draw_drive(np.random.default_rng(seeds["drive"]), bore, course.motion, _BEHIND, course.distance)
     return Scene(course, sensor, drive, seeds)
+
+
+def face_of(scene: Scene) -> Face | None:
+    """Returns the brightness of the bore; `None` where it is the same everywhere."""
+    if scene.course.texture == 0.0:
+        return None
+    bore, seed = scene.drive.bore, int(scene.seeds["texture"].generate_state(1)[0]) >> 1
+    return Face(bore.alignment, bore.section, scene.course.texture, seed)
 
 
 def cast_sweeps(scene: Scene) -> Iterator[Sweep]:
@@ -100,7 +110,8 @@ def cast_sweeps(scene: Scene) -> Iterator[Sweep]:
     lidar = scene.sensor.lidar
     caster = Caster(scene.drive.bore.mesh(), lidar.range_max)
     rng = np.random.default_rng(scene.seeds["lidar"])
-    return sweeps(rng, lidar, Carried(scene.drive, _HERE), caster, SensorErrors(), veil=veil)
+    carried, face, doppler = Carried(scene.drive, _HERE), face_of(scene), scene.course.doppler
+    return sweeps(rng, lidar, carried, caster, SensorErrors(), veil=veil, face=face, doppler=doppler)
 
 
 _HERE = Mount(np.eye(3), np.zeros(3))
@@ -163,6 +174,7 @@ def calibration(scene: Scene) -> dict[str, Any]:
             "topic": scene.sensor.topic, "frame": scene.sensor.frame, "model": scene.course.sensor, "rate": 10.0,
             "rows": scene.sensor.beams, "columns": len(lidar.offset) // scene.sensor.beams,
             "range_min": lidar.range_min, "range_max": lidar.range_max, "stamp": "first point", "motion_in_sweep": True,
+            "doppler": scene.course.doppler,
         },
         "imu": {
             "topic": IMU_TOPIC, "frame": IMU_FRAME, "rate": IMU_RATE, "rest_at_start": REST,

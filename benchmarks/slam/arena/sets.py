@@ -6,7 +6,7 @@ import shutil
 import sys
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ from benchmarks.slam.arena.record import (
     write_recording,
     write_truth,
 )
-from benchmarks.slam.arena.walls import WALLS
+from benchmarks.slam.arena.walls import WALLS, WallName
 from benchmarks.slam.reading import INDEX, RECORDINGS, TRUTH
 from scene.survey.carrier import ACCEL_BIAS, GYRO_BIAS
 
@@ -38,7 +38,11 @@ _BY_BEAMS: tuple[tuple[int, SensorName], ...] = ((6, "avia"), (32, "os1-32"), (6
 _SENSORS = tuple(Course(f"beams-{beams:02d}", "furnished", sensor) for beams, sensor in _BY_BEAMS)
 _DUST = (Course("dust-half", "furnished", dust=0.1), Course("dust-lock", "furnished", dust=1.0))
 _MOTIONS = tuple(Course(f"motion-{name}", "furnished", motion=name) for name in CARRIERS if name != "trolley")
-COURSES: tuple[Course, ...] = (*_DIAL, *_SENSORS, *_DUST, *_MOTIONS)
+_SMOOTH = tuple(Course(f"texture-smooth-{dial}", "smooth", texture=0.01 * dial) for dial in (25, 50, 100))
+_ROUGH: tuple[WallName, ...] = ("joints", "sprayed")
+_TEXTURES = (*_SMOOTH, *(Course(f"texture-{name}-100", name, texture=1.0) for name in _ROUGH))
+_DOPPLER = (Course("doppler-smooth", "smooth", doppler=True),)
+COURSES: tuple[Course, ...] = (*_DIAL, *_SENSORS, *_DUST, *_MOTIONS, *_TEXTURES, *_DOPPLER)
 
 
 @dataclass(frozen=True)
@@ -153,7 +157,7 @@ def redraw(folder: Path, name: str) -> Scene:
         facts = json.loads((folder / TRUTH / name / "course.json").read_text())
     except (OSError, ValueError) as error:
         raise BenchmarkError(f"{folder}: holds no truth of {name}, from which it could be drawn again") from error
-    course = Course(**{key: facts[key] for key in ("name", "walls", "sensor", "motion", "dust", "distance")})
+    course = Course(**{field.name: facts[field.name] for field in fields(Course) if field.name in facts})
     config = replace(ArenaConfig(folder), seed=settings["seed"], secret=settings["secret"])
     return draw_scene(course, course_seed(config, course))
 
@@ -184,6 +188,8 @@ _FIELDS = {
     "motion": ("sc:Text", "Way of carrying it"),
     "dust": ("sc:Float", "Density of the dust that moves with it; 0 is none, 1 full"),
     "distance": ("sc:Float", "Length of the way, m"),
+    "texture": ("sc:Float", "Brightness of the lining; from 0, all alike, to 1"),
+    "doppler": ("sc:Boolean", "The LiDAR measures the speed of each range too"),
 }
 
 
@@ -243,7 +249,7 @@ def as_datasheet(folder: Path, courses: list[Course]) -> str:
     """
     rows = [
         f"| {one.name} | {one.walls} | {one.sensor}, {make_sensor(one.sensor).beams} lines | {one.motion} | "
-        f"{one.dust:g} | {one.distance:g} |"
+        f"{one.dust:g} | {one.distance:g} | {one.texture:g} | {'yes' if one.doppler else 'no'} |"
         for one in courses
     ]
     imu = yaml.safe_load((folder / RECORDINGS / courses[0].name / "calibration.yaml").read_text())["imu"]
@@ -262,8 +268,8 @@ _SHEET = """# Datasheet of this set
 To compare LiDAR and LiDAR-inertial odometry along tunnels, from walls that show no motion to walls that show all of it.
 
 ## What it holds
-| recording | walls | LiDAR | carried by | dust | way, m |
-|---|---|---|---|---|---|
+| recording | walls | LiDAR | carried by | dust | way, m | texture | Doppler |
+|---|---|---|---|---|---|---|---|
 {rows}
 
 Each folder of `recordings/` holds a ROS bag (sweeps, IMU, odometry, `/tf_static`), the odometry as TUM, and

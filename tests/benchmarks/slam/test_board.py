@@ -15,8 +15,8 @@ from tests.benchmarks.slam.tracks import line, write_axis, write_tum
 
 
 def test_slopes_are_those_of_the_ranges_and_jumps_count_as_noise():
-    shift = board._PLACES
-    slope, left = board.fit_slopes(np.column_stack([3.0 - 0.4 * shift, np.where(shift > 0.0, 5.0, 4.0), 0.0 * shift]))
+    shift = PLACES
+    slope, left = fit_slopes(np.column_stack([3.0 - 0.4 * shift, np.where(shift > 0.0, 5.0, 4.0), 0.0 * shift]))
     np.testing.assert_allclose(slope[[0, 2]], [-0.4, 0.0], atol=1e-12)
     np.testing.assert_allclose(left[[0, 2]], 0.0, atol=1e-12)
     assert left[1] > 0.05
