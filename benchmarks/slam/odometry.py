@@ -130,7 +130,7 @@ def by_doppler() -> Step:
 
     def step(points: np.ndarray, attitude: Rotation, turn: np.ndarray) -> Float[np.ndarray, "3"]:
         nonlocal position
-        if np.isnan(points["velocity"]).all():
+        if "velocity" not in (points.dtype.names or ()):
             raise BenchmarkError("its points have no velocity: it is no recording of a Doppler LiDAR")
         rays = np.column_stack([points["x"], points["y"], points["z"]]).astype(float)
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)

@@ -7,7 +7,7 @@ prints one line of JSON. The libraries are optional (`pip install 'subterra-jax[
 import json
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -65,8 +65,7 @@ def _run_rko(recording: Path) -> Poses:
     from rko_lio.config import LIOConfig
     from rko_lio.lio import LIO
 
-    mount = np.eye(4)
-    mount[:3, 3] = -np.array(yaml.safe_load((recording / CALIBRATION).read_text())["imu"]["shift_from_lidar"])
+    mount = np.linalg.inv(_mount(recording))
     program, seconds, rows = LIO(LIOConfig(max_num_threads=1)), 0.0, []
     for stamp, content in read_samples(recording):
         started = time.perf_counter()
@@ -81,10 +80,99 @@ def _run_rko(recording: Path) -> Poses:
     return np.array([t for t, _ in rows]), np.array([pose for _, pose in rows]), seconds
 
 
+def _mount(recording: Path) -> np.ndarray:
+    """Returns the pose of the LiDAR in the IMU's frame."""
+    pose = np.eye(4)
+    pose[:3, 3] = yaml.safe_load((recording / CALIBRATION).read_text())["imu"]["shift_from_lidar"]
+    return pose
+
+
+def _bundles(recording: Path) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+    """Yields the stamp (ns) of each sweep, its returns, and the IMU samples since the last: s, force, turn rate."""
+    samples: list[np.ndarray] = []
+    for stamp, content in read_samples(recording):
+        if isinstance(content, tuple):
+            samples.append(np.concatenate([[1e-9 * stamp], *content]))
+        elif samples:
+            yield stamp, content[(content["x"] != 0.0) | (content["y"] != 0.0)], np.array(samples)
+            samples = samples[-1:]
+
+
+def _xyz(points: np.ndarray) -> np.ndarray:
+    return np.column_stack([points["x"], points["y"], points["z"]]).astype(np.float64)
+
+
+def _run_bundles(step: Callable[[int, np.ndarray, np.ndarray], Any], recording: Path) -> Poses:
+    """Runs a step that returns the time (s) and the pose of the LiDAR after each sweep, or None."""
+    seconds, rows = 0.0, []
+    for bundle in _bundles(recording):
+        started = time.perf_counter()
+        row = step(*bundle)
+        seconds += time.perf_counter() - started
+        rows += [] if row is None else [row]
+    return np.array([t for t, _ in rows]), np.array([pose for _, pose in rows]).reshape(-1, 4, 4), seconds
+
+
+def _run_se3(recording: Path) -> Poses:
+    from se3_lio import SE3LIO
+
+    mount = _mount(recording)
+    program = SE3LIO(None, mount)
+
+    def step(stamp: int, points: np.ndarray, samples: np.ndarray) -> Any:
+        state, _ = program.register_frame(_xyz(points), 1e-9 * points["t"], samples, 1e-9 * stamp)
+        return float(state.stamp), np.array(state.pose) @ mount
+
+    return _run_bundles(step, recording)
+
+
+def _run_genz(recording: Path) -> Poses:
+    from genz_lio import Config, GenZLIO
+
+    config = Config()
+    config.max_threads, config.mapping.extrinsic_t = 1, _mount(recording)[:3, 3]
+    program = GenZLIO(config)
+
+    def step(stamp: int, points: np.ndarray, samples: np.ndarray) -> Any:
+        begin, rest = 1e-9 * stamp, {"intensities": points["intensity"], "rings": points["ring"]}
+        found = program.register_scan(
+            _xyz(points), begin, begin + 0.1, samples, 1e-9 * points["t"], **rest, timing_prepared=True
+        )
+        return (float(found.timestamp), np.array(program.lidar_pose)) if found.valid else None
+
+    return _run_bundles(step, recording)
+
+
+def _run_pelorus(recording: Path) -> Poses:
+    from pelorus import Handle
+
+    program = Handle()
+    none = [0.0] * 9
+
+    def step(stamp: int, points: np.ndarray, samples: np.ndarray) -> Any:
+        for t, *values in samples:
+            seconds, rest = divmod(round(1e9 * t), 1_000_000_000)
+            program.add_imu(seconds, rest, [1.0, 0.0, 0.0, 0.0], [-1.0, *none[1:]], values[3:], none, values[:3], none)
+        program.add_pointcloud(np.column_stack([_xyz(points), points["t"]]), *divmod(stamp, 1_000_000_000))
+        for _ in range(200):  # another thread answers
+            if (found := program.try_recv()) is not None:
+                pose = np.eye(4)
+                w, x, y, z = found["orientation"]
+                pose[:3, :3], pose[:3, 3] = Rotation.from_quat([x, y, z, w]).as_matrix(), found["position"]
+                return found["timestamp_sec"] + 1e-9 * found["timestamp_nanosec"], pose
+            time.sleep(0.005)
+        return None
+
+    return _run_bundles(step, recording)
+
+
 PROGRAMS = {
     **{f"evalio-{name}": Program("evalio", partial(_run_evalio, name))
        for name in ("kiss", "genz", "mad", "ct", "loam", "liosam", "dlio", "form")},
     "rko-lio": Program("rko-lio", _run_rko),
+    "genz-lio": Program("genz-lio", _run_genz),
+    "pelorus": Program("pelorus", _run_pelorus),
+    "se3-lio": Program("se3-lio", _run_se3),
     "intensity-odometry": Program("subterra-jax", partial(odometry.run, odometry.by_brightness)),
     DOPPLER: Program("subterra-jax", partial(odometry.run, odometry.by_doppler)),
 }  # fmt: skip

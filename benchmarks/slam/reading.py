@@ -17,11 +17,11 @@ RECORDINGS, TRUTH, INDEX = "recordings", "truth", "set.json"  # folders and file
 CALIBRATION, TRUTH_FILE, ODOMETRY = "calibration.yaml", "lidar.tum", "odometry.tum"
 
 Poses = tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 4 4"], float]  # times, s; LiDAR poses; run time, s
-# One layout for all drivers: m, reflectivity or intensity as reported, ns after the header's stamp, line, m/s or NaN.
+# One layout for all drivers: m, reflectivity or intensity as reported, ns after the header's stamp, line.
 POINT = np.dtype([
     ("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("t", "<u4"), ("ring", "<u2"),
-    ("velocity", "<f4"),
 ])  # fmt: skip
+DOPPLER_POINT = np.dtype([*POINT.descr, ("velocity", "<f4")])  # m/s, positive away
 _KINDS = {2: "u1", 4: "<u2", 6: "<u4", 7: "<f4", 8: "<f8"}
 _TIMES = {"time": 1e9, "t": 1.0}  # field of Velodyne's and Ouster's drivers, and its unit in ns
 # Livox's point in CDR: 19 bytes, aligned to 4.
@@ -85,7 +85,9 @@ def _open_bag(folder: Path) -> Any:
 
 
 def sweep_points(message: Any) -> np.ndarray:
-    """Returns the points of a Velodyne's or Ouster's `PointCloud2` or a Livox's `CustomMsg`, `(n,)` of `POINT`.
+    """Returns the points of a `PointCloud2` of Velodyne or Ouster or of a Livox `CustomMsg`, `(n,)` of `POINT`.
+
+    Those of a Doppler LiDAR are of `DOPPLER_POINT`.
 
     Beams without a return stay, at (0, 0, 0), where the driver keeps them.
 
@@ -93,7 +95,7 @@ def sweep_points(message: Any) -> np.ndarray:
         ValueError: The cloud has no time of its points.
     """
     if hasattr(message, "point_num"):
-        rows = [(p.x, p.y, p.z, p.reflectivity, p.offset_time, p.line, np.nan) for p in message.points]
+        rows = [(p.x, p.y, p.z, p.reflectivity, p.offset_time, p.line) for p in message.points]
         return np.array(rows, POINT)
     fields = {field.name: field for field in message.fields}
     names = list(fields)
@@ -105,11 +107,10 @@ def sweep_points(message: Any) -> np.ndarray:
     time = next((name for name in _TIMES if name in fields), None)
     if time is None:
         raise ValueError(f"its points have no time; they have {', '.join(names)}")
-    points = np.zeros(len(raw), POINT)
-    for name in ("x", "y", "z", "ring"):
+    points = np.zeros(len(raw), DOPPLER_POINT if "velocity" in fields else POINT)
+    for name in {*(points.dtype.names or ())} - {"intensity", "t"}:
         points[name] = raw[name]
     points["intensity"] = raw["reflectivity" if "reflectivity" in fields else "intensity"]  # which no range weakens
-    points["velocity"] = raw["velocity"] if "velocity" in fields else np.nan
     points["t"] = np.rint(_TIMES[time] * raw[time].astype(np.float64))
     return points
 
@@ -124,9 +125,8 @@ def livox_points(raw: bytes) -> tuple[int, np.ndarray]:
     count = int(np.frombuffer(raw, "<u4", 1, begin + 16)[0])
     rows = np.frombuffer(bytes(raw[begin + 20 :]) + b"\0", _LIVOX_CDR, count)
     points = np.zeros(count, POINT)
-    for name in _LIVOX_CDR.names or ():
+    for name in POINT.names or ():
         points[name] = rows[name]
-    points["velocity"] = np.nan
     return seconds * 1_000_000_000 + rest, points
 
 

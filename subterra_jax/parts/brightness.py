@@ -21,8 +21,8 @@ def wall_brightness(
     station: Float[Array, ""],
     position: Float[Array, "2"],
     ends: Float[Array, "n d"],
-    texture: Float[Array, ""] | float,
-) -> tuple[Float[Array, "n"], Float[Array, "n 2"]]:
+    texture: Float[Array, ""] | float | None,
+) -> tuple[Float[Array, "n"] | float, Float[Array, "n 2"]]:
     """Return factors on the reflectivity of the lining where beams end, and the tangent of the axis there.
 
     Args:
@@ -30,13 +30,15 @@ def wall_brightness(
         station: Station of the sensor, m.
         position: Its position in plan, tunnel frame, m.
         ends: Ends of the beams, tunnel frame, m; in plan those of a planar LiDAR.
-        texture: Dial, 0 to 1.
+        texture: Dial, 0 to 1; `None` is 0.
     """
     _, _, tangent_x, tangent_y, _ = at_station(tunnel, station)
     near = station + (ends[:, 0] - position[0]) * tangent_x + (ends[:, 1] - position[1]) * tangent_y
     node = jax.vmap(node_at, (None, 0))(tunnel, near)
     row = tunnel.grid[node]
     away, tangent = ends[:, :2] - row[:, :2], row[:, 2:4]
+    if texture is None:
+        return 1.0, tangent
     ahead = away[:, 0] * tangent[:, 0] + away[:, 1] * tangent[:, 1]
     left = tangent[:, 0] * away[:, 1] - tangent[:, 1] * away[:, 0]
     above: Any = constants.SPATIAL_HEIGHT

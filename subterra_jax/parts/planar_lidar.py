@@ -35,8 +35,7 @@ class PlanarLidar(Part):
         entries = {"ranges": lidar.add_noise(ranges, noise.normal[:n], params.lidar)}
         if params.lidar.intensity:
             ends = sight.position + walls[:, None] * directions
-            texture = 0.0 if params.lidar.texture is None else params.lidar.texture
-            factor, tangent = wall_brightness(sight.tunnel, sight.station, sight.position, ends, texture)
+            factor, tangent = wall_brightness(sight.tunnel, sight.station, sight.position, ends, params.lidar.texture)
             slant = jnp.abs(tangent[:, 0] * directions[:, 1] - tangent[:, 1] * directions[:, 0])
             met = things < walls
             reflectivity = jnp.where(met, echo.ALBEDO_THING, echo.ALBEDO_LINING * factor)

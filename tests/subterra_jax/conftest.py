@@ -18,8 +18,8 @@ with install_import_hook("subterra_jax" if _FIRST else (), f"{checking.__name__}
     from subterra_jax.tunnel.sources import load_tunnel
 
     for name in subterra_jax.__all__:  # imported at first use, which must happen under the hook
-        # The contract of agents is a protocol, which nobody can check at run time.
-        if name != "load_policy":
+        # The contract of agents is a protocol, which nobody can check at run time; the second is beside it.
+        if name not in ("load_policy", "localisability"):
             getattr(subterra_jax, name)
 
 

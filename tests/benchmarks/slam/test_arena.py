@@ -250,7 +250,7 @@ def test_walls_differ_by_walls_alone():
 def test_a_set_is_planned_from_its_seed_and_a_secret_hides_it():
     config = sets.ArenaConfig(Path("o"))
     plan = sets.plan_arena(config)
-    assert len(plan) == len({one.name for one in plan}) == 12
+    assert len(plan) == len({one.name for one in plan}) == 18
     states = [sets.course_seed(config, one).entropy for one in plan]
     assert len(set(states)) == 1
     secret = [sets.course_seed(replace(config, secret=5), one).entropy for one in plan]

@@ -11,6 +11,7 @@ from benchmarks.slam import board, board_page, programs
 from benchmarks.slam.arena.record import Course, draw_scene
 from benchmarks.slam.board_page import records_of
 from benchmarks.slam.score import reach_of
+from subterra_jax.evaluation.localisability import PLACES, fit_slopes
 from tests.benchmarks.slam.tracks import line, write_axis, write_tum
 
 
