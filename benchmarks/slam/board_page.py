@@ -17,11 +17,17 @@ _PANELS = {
     "beams, furnished": ("beams-06", "walls-furnished", "beams-32", "beams-64"),
     "dust, furnished": ("walls-furnished", "dust-half", "dust-lock"),
     "carried by": ("motion-walk", "motion-b2"),
+    "texture, smooth": ("walls-smooth", "texture-smooth-25", "texture-smooth-50", "texture-smooth-100"),
+    "texture 1": ("texture-joints-100", "texture-sprayed-100"),
+    "Doppler": ("doppler-smooth",),
 }
 _NAMES = {
     "walls-smooth": "smooth", "walls-joints": "joints", "walls-pockets": "pockets", "walls-furnished": "furnished",
     "walls-sprayed": "sprayed", "beams-06": "6 beams", "beams-32": "32 beams", "beams-64": "64 beams",
     "dust-half": "thin dust", "dust-lock": "own cloud", "motion-walk": "walked", "motion-b2": "B2",
+    "texture-smooth-25": "smooth, texture 0.25", "texture-smooth-50": "smooth, texture 0.5",
+    "texture-smooth-100": "smooth, texture 1", "texture-joints-100": "joints, texture 1",
+    "texture-sprayed-100": "sprayed, texture 1", "doppler-smooth": "smooth, Doppler",
 }  # fmt: skip
 _OURS = {"wheel-odometry": ("0.3", "s")}  # colour and marker of what is not a SLAM program
 _ASIDE = 0.05  # of the distance between two recordings, from one program to the next
@@ -71,7 +77,7 @@ def records_of(board: dict[str, Any]) -> list[Record]:
     facts["split"] = "drives of the arena; interval: least to largest of the seeds"
     found = []
     for recording in _held(board):
-        name = _NAMES[recording].replace(" ", "-").lower()
+        name = _NAMES[recording].replace(",", "").replace(" ", "-").lower()
         for program in _programs(board):
             if (drift := median_drift(board["rows"], program, recording)) is not None:
                 middle, low, high = (round(value, 2) for value in drift)
@@ -127,7 +133,7 @@ def draw_board(board: dict[str, Any]) -> Figure:
     panels = {title: names for title, names in panels.items() if names}
     widths = [max(1.2, len(names)) for names in panels.values()]
     figure, axes = plt.subplots(
-        1, len(panels), figsize=(11.0, 5.2), sharey=True, width_ratios=widths, layout="constrained", squeeze=False
+        1, len(panels), figsize=(13.0, 5.2), sharey=True, width_ratios=widths, layout="constrained", squeeze=False
     )
     for panel, (title, names) in zip(axes[0], panels.items(), strict=True):
         _draw_panel(panel, board, title, names)
@@ -159,7 +165,11 @@ def _draw_panel(axes: Axes, board: dict[str, Any], title: str, names: list[str])
 
 
 def _tick(recording: str, title: str) -> str:
-    """Returns the label of a recording; the furnished drive ends three scales."""
+    """Returns the label of a recording; two drives stand on several scales."""
+    if title.startswith("texture,"):
+        return _NAMES[recording].removeprefix("smooth, texture ").replace("smooth", "0")
+    if title in ("texture 1", "Doppler"):
+        return _NAMES[recording].partition(",")[0]
     if recording != "walls-furnished" or title == "walls":
         return _NAMES[recording]
     return "16 beams" if title.startswith("beams") else "none"

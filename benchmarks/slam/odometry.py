@@ -21,7 +21,7 @@ _REACH, _ROUND, _COLUMNS = 6.0, 352, 512  # m either way that are used; cells ro
 _SHIFTS = np.arange(-0.3, 0.301, 0.02)  # m about the place that is expected
 _LEAST = 0.15  # correlation below which brightness says nothing
 _BLEND = 0.3  # of a new speed
-_SECTION = 72  # directions in which the section is followed
+_STRIP = 2  # cells round whose brightness is compared with their mean
 _SWEEP = 0.1  # s
 _CHANGE = 1e-6  # of the logarithm of the intensity: below, it is constant
 
@@ -64,7 +64,7 @@ def _cell_round(angle: Float[np.ndarray, "n"]) -> np.ndarray:
 
 
 def unroll(points: Float[np.ndarray, "n 3"], intensity: Float[np.ndarray, "n"]) -> tuple[np.ndarray, ...]:
-    """Returns distances along the axis (m), angles round it (rad) and the logarithm of the brightness of a sweep.
+    """Returns distances along the axis (m), angles round it (rad) and how bright a sweep is there, beside its mean.
 
     Args:
         points: Points about the sensor, m; the axis is ahead.
@@ -73,21 +73,12 @@ def unroll(points: Float[np.ndarray, "n 3"], intensity: Float[np.ndarray, "n"]) 
     near = (np.abs(points[:, 0]) < _REACH) & (intensity > 0.0) & (np.abs(points[:, 1:]).sum(axis=1) > 0.5)
     ray, seen = points[near], intensity[near]
     middle = 0.5 * (np.percentile(ray[:, 1:], 1.0, axis=0) + np.percentile(ray[:, 1:], 99.0, axis=0))
-    left, up = (ray[:, 1:] - middle).T
-    angle, radius = np.arctan2(left, up), np.hypot(left, up)
-    bins = np.floor((0.5 + angle / (2.0 * np.pi)) * _SECTION).astype(int) % _SECTION
-    held = np.bincount(bins, minlength=_SECTION)
-    section = np.bincount(bins, radius, _SECTION) / np.maximum(held, 1)
-    full = np.flatnonzero(held)
-    section = np.interp(np.arange(_SECTION), full, section[full], period=_SECTION)
-    slope = (np.roll(section, -1) - np.roll(section, 1)) / (4.0 * np.pi / _SECTION)
-    # The wall's normal lies across the axis: out along the radius, less the section's slope round it.
-    out, around = section[bins], -slope[bins]
-    toward = np.sin(angle) * ray[:, 1] + np.cos(angle) * ray[:, 2]
-    across = np.cos(angle) * ray[:, 1] - np.sin(angle) * ray[:, 2]
-    cosine = np.abs(out * toward + around * across) / np.hypot(out, around) / np.linalg.norm(ray, axis=1)
-    value = np.log(seen) - np.log(np.maximum(cosine, 0.1))
-    return ray[:, 0], angle, value - np.median(value)
+    angle = np.arctan2(*(ray[:, 1:] - middle).T)
+    # The cosine of incidence is a number of the angle over the range: all that is the same along the wall goes.
+    value = np.log(seen) + np.log(np.linalg.norm(ray, axis=1))
+    strip = _cell_round(angle) // _STRIP
+    mean = np.bincount(strip, value) / np.maximum(np.bincount(strip), 1)
+    return ray[:, 0], angle, value - mean[strip]
 
 
 def by_brightness() -> Step:

@@ -21,6 +21,7 @@ from benchmarks.command import BenchmarkError
 from benchmarks.slam import odometry
 from benchmarks.slam.reading import CALIBRATION, Poses, read_samples
 from scene.poses.trajectory import Trajectory, save_tum
+from subterra_jax.host.versions import VERSION
 
 WHEELS, DOPPLER = "wheel-odometry", "doppler-odometry"
 # What is not left at a program's defaults: sums of several threads differ from run to run; points are undistorted by
@@ -32,7 +33,7 @@ _CHANGES = {"max_num_threads": 1, "num_threads": 1, "ls_num_threads": 1, "number
 class Program(NamedTuple):
     """A program that gives poses."""
 
-    package: str  # Package that it comes with
+    package: str  # Package that it comes with; empty for ours
     run: Callable[[Path], Poses]  # Runs it on the folder of a recording of the arena
 
 
@@ -173,8 +174,8 @@ PROGRAMS = {
     "genz-lio": Program("genz-lio", _run_genz),
     "pelorus": Program("pelorus", _run_pelorus),
     "se3-lio": Program("se3-lio", _run_se3),
-    "intensity-odometry": Program("subterra-jax", partial(odometry.run, odometry.by_brightness)),
-    DOPPLER: Program("subterra-jax", partial(odometry.run, odometry.by_doppler)),
+    "intensity-odometry": Program("", partial(odometry.run, odometry.by_brightness)),
+    DOPPLER: Program("", partial(odometry.run, odometry.by_doppler)),
 }  # fmt: skip
 
 
@@ -188,7 +189,8 @@ def find_program(name: str, installed: bool = True) -> str:
         return ""
     if name not in PROGRAMS:
         raise BenchmarkError(f"no program {name!r}; there are {', '.join([WHEELS, *PROGRAMS])}")
-    package = PROGRAMS[name].package
+    if not (package := PROGRAMS[name].package):
+        return VERSION
     try:
         return version(package)
     except PackageNotFoundError as error:

@@ -1,5 +1,6 @@
 """Brightness and speeds in recordings: fixed to the wall, equal to the batch's, and what two programs make of them."""
 
+import dataclasses
 from itertools import islice
 
 import jax
@@ -50,7 +51,7 @@ def unrolled(texture, seed=None):
         middle = scene.drive.poses(np.array([1e-9 * sweep.begin + 0.05])).position[0] - frames.position[0]
         at = float(middle @ frames.tangent[0])
         along, angle, value = odometry.unroll(placed - (at, 0.0, 0.0), sweep.reflectivity[sweep.valid].astype(float))
-        near = np.abs(along) < 3.0
+        near = (np.abs(along) < 3.0) & (np.abs(np.abs(angle) - 1.5) < 0.35)  # without the floor
         images.append(by_cell(scene.drive.begin + at + along[near], angle[near], value[near]))
     return images
 
