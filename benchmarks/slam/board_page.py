@@ -130,7 +130,9 @@ def draw_board(board: dict[str, Any]) -> Figure:
     """Draws axial drift per 100 m against walls, beams, dust and carriers, beside the floor."""
     held = _held(board)
     panels = {title: [name for name in names if name in held] for title, names in _PANELS.items()}
-    panels = {title: names for title, names in panels.items() if names}
+    panels = {
+        title: names for title, names in panels.items() if names and (title == "walls" or names != ["walls-smooth"])
+    }
     widths = [max(1.2, len(names)) for names in panels.values()]
     figure, axes = plt.subplots(
         1, len(panels), figsize=(13.0, 5.2), sharey=True, width_ratios=widths, layout="constrained", squeeze=False

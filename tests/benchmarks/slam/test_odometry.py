@@ -48,11 +48,11 @@ def unrolled(texture, seed=None):
     frames, images = bore.alignment.frames(np.array([scene.drive.begin])), []
     for sweep in islice(seen, 14, 16):
         placed = (sweep.placed[sweep.valid] - frames.position[0]) @ frames.matrix[0]
-        middle = scene.drive.poses(np.array([1e-9 * sweep.begin + 0.05])).position[0] - frames.position[0]
-        at = float(middle @ frames.tangent[0])
-        along, angle, value = odometry.unroll(placed - (at, 0.0, 0.0), sweep.reflectivity[sweep.valid].astype(float))
+        pose = scene.drive.poses(np.array([1e-9 * sweep.begin + 0.05])).position[0]
+        sensor = (pose - frames.position[0]) @ frames.matrix[0]
+        along, angle, value = odometry.unroll(placed - sensor, sweep.reflectivity[sweep.valid].astype(float))
         near = (np.abs(along) < 3.0) & (np.abs(np.abs(angle) - 1.5) < 0.35)  # without the floor
-        images.append(by_cell(scene.drive.begin + at + along[near], angle[near], value[near]))
+        images.append(by_cell(scene.drive.begin + sensor[0] + along[near], angle[near], value[near]))
     return images
 
 
