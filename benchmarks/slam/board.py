@@ -19,7 +19,7 @@ from benchmarks.command import BenchmarkError, require_least
 from benchmarks.results import environment_facts, write_file
 from benchmarks.slam.arena.record import Scene, face_of
 from benchmarks.slam.arena.sets import redraw
-from benchmarks.slam.programs import DOPPLER, PROGRAMS, WHEELS, find_program
+from benchmarks.slam.programs import DOPPLER, FURTHER, PROGRAMS, WHEELS, find_program
 from benchmarks.slam.reading import ODOMETRY, TRUTH, TRUTH_FILE, check_recording, measures_speed, recordings_in
 from benchmarks.slam.score import LEAST_COVERED, score_files
 from scene.survey.carrier import rotate
@@ -118,7 +118,8 @@ class BoardConfig:
 
     out: Path  # Folder for poses, `board.json`, `board.md`, `board.png` and `records.json`.
     sets: tuple[Path, ...] = ()  # Sets of the arena with their truth, one for each seed.
-    programs: tuple[str, ...] = (WHEELS, *PROGRAMS)  # Programs to run; by default all, the odometer included.
+    # Programs to run; by default all of the extra `slam`, ours and the odometer.
+    programs: tuple[str, ...] = tuple(name for name in (WHEELS, *PROGRAMS) if name not in FURTHER)
     jobs: int = 1  # Programs run at a time.
     limit: float = 1800.0  # Time after which a program counts as failed on a recording, s.
     # Run what is missing; otherwise only poses that are in `out` already are scored, and no bag is needed.

@@ -177,6 +177,7 @@ PROGRAMS = {
     "intensity-odometry": Program("", partial(odometry.run, odometry.by_brightness)),
     DOPPLER: Program("", partial(odometry.run, odometry.by_doppler)),
 }  # fmt: skip
+FURTHER = ("genz-lio", "pelorus", "se3-lio")  # whose packages are no part of the extra `slam`
 
 
 def find_program(name: str, installed: bool = True) -> str:

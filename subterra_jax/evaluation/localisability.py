@@ -62,7 +62,7 @@ def localisability(env: Env, params: EnvParams, step: float = 1.0, index: int = 
     places = jnp.asarray(station[:, None] + PLACES, jnp.float32)
     sensor = params.lidar
     seen = {name: np.asarray(values, np.float64) for name, values in _look(env, params, places, index).items()}
-    ranges = seen.get("ranges", seen.get("scan"))
+    ranges = seen["ranges" if "ranges" in seen else "scan"]
     limit = float(np.max(np.asarray(sensor.range_max)))
     there = (ranges < limit).all(axis=1)
     slope, left = fit_slopes(ranges.swapaxes(0, 1))
