@@ -27,6 +27,7 @@ class TunnelChoice:
     lining: str | None = None  # as for `subterra_jax.make`
     # start and length of the piece that the task cuts out, m; `None` for the whole
     piece: tuple[float, float] | None = None
+    texture: float = 0.0  # as for `subterra_jax.make`
 
     def plan(self, number: int) -> TunnelPlan:
         """Return the plan of a tunnel, with its bore where there is one.
@@ -101,7 +102,8 @@ class FollowCamera:
         station, facing = float(plan.station[node]), float(ahead[:2] @ plan.tangent[node])
         if self._piece is not None and self._piece.plan is plan and self._piece.shows(station, facing):
             return plan
-        self._piece = Piece.around(plan, self._choice.lining, station, facing)
+        piece = Piece.around(plan, self._choice.lining, station, facing)
+        self._piece = dataclasses.replace(piece, texture=self._choice.texture)
         spec = stage_spec(self._piece, leave_out=self._leave_out)
         if self._furnish is not None:
             self._furnish(spec, self._piece)

@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
-from subterra_jax.pictures.surfaces import Surface, tunnel_surfaces
+from subterra_jax.host.texture import brightness, wall_angle
+from subterra_jax.pictures.surfaces import AROUND, Surface, tunnel_surfaces
 from subterra_jax.tunnel.plan import TunnelPlan
+from subterra_jax.tunnel.shell import Shell
 
 if TYPE_CHECKING:
     import mujoco
@@ -19,7 +21,8 @@ from typing import NamedTuple
 BEHIND, AHEAD = 30.0, 70.0  # of the robot, m: the piece that is drawn
 _MARGIN = 20.0  # m from the end of a piece at which the next one is made
 _LAMP_SPACING, _BELOW_CROWN, _CROWN = 8.0, 0.5, 5.0  # m
-_TILE, _PIXELS = 4.0, 512  # of the wall's texture: m, pixels
+_TILE, _PIXELS = 4.0, 512  # of a texture of noise: m, pixels
+_PIXEL = 0.05  # m of the wall's own brightness
 _DARK = 0.05  # grey of what lies beyond the fog
 
 
@@ -31,6 +34,7 @@ class Piece:
     lining: str | None  # variant of its walls
     start: float  # first station, m
     end: float  # last station, m
+    texture: float = 0.0  # dial of the walls' brightness, 0 to 1
 
     @classmethod
     def around(cls, plan: TunnelPlan, lining: str | None, station: float, facing: float = 1.0) -> Piece:
@@ -61,14 +65,15 @@ def stage_spec(piece: Piece, *, leave_out: tuple[str, ...] = ()) -> mujoco.MjSpe
     spec.modelname = "tunnel"
     _set_view(spec)
     _add_sky(spec, piece)
-    pixels = _noise_picture()
-    texture = spec.add_texture(
-        name="wall", type=mujoco.mjtTexture.mjTEXTURE_2D, width=_PIXELS, height=_PIXELS, nchannel=3
-    )
-    texture.data = pixels.tobytes()
+    pixels, of_wall = _noise_picture(), (_TILE, _TILE)
+    _add_picture(spec, "noise", pixels)
+    if piece.texture > 0.0 and piece.plan.texture is not None and piece.plan.shell is not None:
+        pixels, of_wall = _wall_picture(piece, piece.plan.shell, piece.plan.texture)
+    _add_picture(spec, "wall", pixels)
     for surface in tunnel_surfaces(piece.plan, piece.lining, piece.start, piece.end):
         if surface.name not in leave_out:
-            add_surface(spec, surface)
+            walled = surface.name == "wall"
+            add_surface(spec, surface, *(("wall", of_wall) if walled else ()))
     for k, place in enumerate(_lamps(piece)):
         spec.worldbody.add_light(
             name=f"lamp_{k}", pos=place, dir=(0.0, 0.0, -1.0), cutoff=180.0, exponent=0.0, castshadow=False,
@@ -77,8 +82,18 @@ def stage_spec(piece: Piece, *, leave_out: tuple[str, ...] = ()) -> mujoco.MjSpe
     return spec
 
 
-def add_surface(spec: mujoco.MjSpec, surface: Surface) -> None:
-    """Adds a surface to the world as a mesh that collides with nothing."""
+def _add_picture(spec: mujoco.MjSpec, name: str, pixels: np.ndarray) -> None:
+    import mujoco
+
+    height, width, _ = pixels.shape
+    texture = spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, width=width, height=height, nchannel=3)
+    texture.data = pixels.tobytes()
+
+
+def add_surface(
+    spec: mujoco.MjSpec, surface: Surface, picture: str = "noise", size: tuple[float, float] = (_TILE, _TILE)
+) -> None:
+    """Adds a surface to the world as a mesh that collides with nothing, with a picture of a size, m."""
     import mujoco
 
     points, faces = surface.triangles.vertices, surface.triangles.faces
@@ -88,11 +103,11 @@ def add_surface(spec: mujoco.MjSpec, surface: Surface) -> None:
     mesh.uservert, mesh.userface = (points - origin).ravel().tolist(), faces.ravel().tolist()
     textured = surface.rolled is not None
     if surface.rolled is not None:
-        mesh.usertexcoord = (surface.rolled / _TILE).ravel().tolist()
+        mesh.usertexcoord = (surface.rolled / size).ravel().tolist()
         mesh.userfacetexcoord = faces.ravel().tolist()
     material = spec.add_material(name=own, rgba=(*surface.colour, 1.0), specular=0.1, shininess=0.2)
     if textured:
-        material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "wall"
+        material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = picture
     spec.worldbody.add_geom(
         name=own, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=own, material=own, pos=origin, contype=0, conaffinity=0,
         group=1,
@@ -152,6 +167,26 @@ def _lamps(piece: Piece) -> Float[np.ndarray, "k 3"]:
     crown = shell.radius[:, int(np.argmin(np.abs(shell.angle - 0.5 * np.pi)))]
     columns = (shell.position + (crown - _BELOW_CROWN)[:, None] * shell.up).T
     return np.stack([np.interp(station + shell.window[0], shell.station, column) for column in columns], axis=-1)
+
+
+def _wall_picture(piece: Piece, shell: Shell, seed: int) -> tuple[np.ndarray, tuple[float, float]]:
+    """Return a picture of the brightness of a piece's wall, `(around, along, 3)` uint8, and its size along and around.
+
+    It is for walls rolled out as by `surfaces`; what is off the bore's usual section lies a little beside its place.
+    """
+    radius, own = np.median(shell.section), shell.window[0] + np.array([piece.start - AROUND, piece.end + AROUND])
+    first = shell.station[shell.station >= own[0]][0] - shell.window[0]
+    station = first + (np.arange(int(np.ptp(own) / _PIXEL)) + 0.5) * _PIXEL
+    turn = (np.arange(int(2.0 * np.pi * radius / _PIXEL)) + 0.5) * _PIXEL / radius
+    reach = np.interp(turn, shell.angle, shell.section, period=2.0 * np.pi)
+    ground = np.interp(station, piece.plan.station, piece.plan.elevation)
+    height = np.median(np.interp(station + shell.window[0], shell.station, shell.position[:, 2]) - ground)
+    angle = wall_angle(np, reach * np.cos(turn), reach * np.sin(turn) + height)
+    places = np.broadcast_arrays(station[None], angle[:, None])
+    shade = np.clip(0.8 * brightness(np, *places, seed, piece.texture), 0.0, 1.0)
+    # MuJoCo counts rows from the top.
+    pixels = np.repeat((255.0 * shade[::-1]).astype(np.uint8)[..., None], 3, axis=2)
+    return pixels, (len(station) * _PIXEL, 2.0 * np.pi * radius)
 
 
 def _noise_picture() -> np.ndarray:

@@ -17,7 +17,7 @@ WALL, RECESS, FLOOR = (0.66, 0.65, 0.62), (0.36, 0.355, 0.345), (0.43, 0.41, 0.3
 _STEEL, _SLEEPER, _FURNITURE = (0.40, 0.33, 0.28), (0.62, 0.61, 0.58), (0.38, 0.47, 0.53)
 _LEVEL = 0.7  # cosine of the steepest floor
 _SUNK, _RIM = 0.02, 0.03  # m behind the smooth wall and beyond a recess's sides, to which its points belong to it
-_AROUND = 6.0  # m of shell kept beyond the piece, so that recesses at its ends are whole
+AROUND = 6.0  # m of shell kept beyond the piece, so that recesses at its ends are whole
 _THIN = 0.06  # m; a part of the track whose half width is less is a rail
 
 
@@ -85,7 +85,7 @@ def short_shell(shell: Shell, start: float, end: float) -> Shell:
         end: Last station, m.
     """
     station = shell.station
-    keep = (station >= start - _AROUND) & (station <= end + _AROUND)
+    keep = (station >= start - AROUND) & (station <= end + AROUND)
     zero = station[keep][0]
 
     def near(brick: np.ndarray) -> np.ndarray:

@@ -61,11 +61,12 @@ def view_for(
     split: str | None,
     lining: str | None,
     sensor: Any = SENSORS[0],
+    texture: float = 0.0,
 ) -> tuple[View, Any]:
     """Return the view of an environment that `subterra_jax.make` is to make, and its tunnel; errors as there."""
     known = TASKS.get(id := find(task))
     tunnel = tunnel_for(id, tunnel, split, spatial=not is_planar(sensor))
-    return make_view(view, TunnelChoice(tunnel, lining, None if known is None else known.piece)), tunnel
+    return make_view(view, TunnelChoice(tunnel, lining, None if known is None else known.piece, texture)), tunnel
 
 
 class TopView:
