@@ -61,7 +61,7 @@ def localisability(env: Env, params: EnvParams, step: float = 1.0, index: int = 
     station = np.arange(0.5 * step, float(params.tunnel.pick(index).length), step)
     places = jnp.asarray(station[:, None] + PLACES, jnp.float32)
     sensor = params.lidar
-    seen = {name: np.asarray(values, np.float64) for name, values in _look(env, params, places, index).items()}
+    seen = {name: np.asarray(values, np.float64) for name, values in look_along(env, params, places, index).items()}
     ranges = seen["ranges" if "ranges" in seen else "scan"]
     limit = float(np.max(np.asarray(sensor.range_max)))
     there = (ranges < limit).all(axis=1)
@@ -86,7 +86,7 @@ def fit_slopes(values: Float[np.ndarray, "k *n"]) -> tuple[Float[np.ndarray, "*n
     return slope, np.mean((middle - line) ** 2, axis=0)
 
 
-def _look(env: Any, params: EnvParams, places: Float[Array, "n k"], index: int) -> dict[str, Array]:
+def look_along(env: Any, params: EnvParams, places: Float[Array, "n k"], index: int) -> dict[str, Array]:
     """Return what the LiDAR shows at stations on the axis without noise, by channel, `(n, k, beams)`."""
     sensor = params.lidar
     if hasattr(sensor, "echo"):
