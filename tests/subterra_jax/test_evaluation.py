@@ -3,7 +3,9 @@
 import dataclasses
 import hashlib
 from importlib import resources
+from types import SimpleNamespace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -16,12 +18,15 @@ from subterra_jax.baselines.registry import AgentError, make_agent, register
 from subterra_jax.evaluation import Records, evaluate, listed_episodes
 from subterra_jax.evaluation import episodes as lists
 from subterra_jax.evaluation.episodes import EvaluationError
+from subterra_jax.evaluation.floor import is_above
 from subterra_jax.evaluation.records import (
     add_estimate,
+    add_step,
     area,
     crps,
     interval,
     start_estimates,
+    start_tally,
     summarise,
 )
 from subterra_jax.rules import GoalParams
@@ -151,6 +156,24 @@ def test_crps_of_a_normal_distribution_is_the_integral_that_defines_it():
 
         squared = (norm.cdf(x, error, sigma) - (x >= 0.0)) ** 2
         np.testing.assert_allclose(crps(jnp.float32(error), jnp.float32(sigma)), np.trapezoid(squared, x), rtol=1e-3)
+
+
+def test_an_episode_sums_its_offsets_and_keeps_its_least_clearance():
+    env, params = st.make("Subterra/TraverseShort-v1", tunnel="control")
+    _, state = env.reset(jax.random.key(0), params)
+    tally = start_tally(env, state, params)
+    for lateral, clearance in ((0.5, 0.4), (-1.0, 0.2), (0.5, 0.6)):
+        info = {"lateral": lateral, "half_width": 2.0, "clearance": clearance, "coverage": 0.0, "success": False,
+                "contact": False, "estimate_error": 0.0, "estimate_log_sigma": 0.0}  # fmt: skip
+        taken = SimpleNamespace(before=state, after=state, action=jnp.zeros(4), info=jax.tree.map(jnp.asarray, info))
+        tally = add_step(tally, taken, jnp.float32(1.0))
+    assert float(tally.offset) == pytest.approx(1.0)
+    assert float(tally.clearance) == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize(("errors", "above"), [(3.9, False), (4.1, True)])
+def test_a_share_is_above_a_bound_by_four_standard_errors(errors, above):
+    assert is_above(0.3 + errors * np.sqrt(0.3 * 0.7 / 400), 0.3, 400) == above
 
 
 def tallied(errors, tolerance=1.0):

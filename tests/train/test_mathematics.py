@@ -59,6 +59,12 @@ def test_advantages_have_no_mean_and_unit_spread_over_all_parts():
     assert float(jnp.std(alike)) == pytest.approx(1.0, abs=1e-4)
 
 
+def test_the_auxiliary_loss_is_the_negative_log_likelihood_of_laplace():
+    estimate, error = jnp.array([[1.0, 0.7], [2.0, -0.4]]), jnp.array([[1.5], [0.0]])
+    wanted = np.mean([0.5 * np.exp(-0.7) + 0.7, 2.0 * np.exp(0.4) - 0.4])
+    assert float(learning.auxiliary_loss(estimate, error)) == pytest.approx(wanted, rel=1e-6)
+
+
 def test_running_statistics_equal_those_of_all_the_data_at_once():
     rng = np.random.default_rng(0)
     data = (rng.standard_normal((6, 50, 20, 3)) * [1.0, 5.0, 0.1] + [0.0, 20.0, -3.0]).astype(np.float32)

@@ -110,7 +110,12 @@ def test_the_flag_is_raised_within_2_metres_of_the_goal():
 
 
 @pytest.mark.parametrize(
-    ("command", "stands"), [((0.043, 0.0), True), ((0.058, 0.0), False), ((0.0, 0.48), True), ((0.0, 0.52), False)]
+    ("command", "stands"),
+    [
+        ((0.043, 0.0), True),
+        ((0.058, 0.0), False),
+        *(((0.0, side * rate), rate < 0.5) for rate in (0.48, 0.52) for side in (-1, 1)),
+    ],
 )
 def test_below_5_centimetres_and_half_a_radian_a_second_is_standing(command, stands):
     id = "Subterra/StopAt-v1"
