@@ -26,7 +26,7 @@ from benchmarks.fidelity.derive.surface import Caster, Nearest
 from benchmarks.records import Record, measured, write_records
 from benchmarks.results import environment_facts, markdown_table, write_file
 from benchmarks.truth import f1, one_to_one, sleepers_of
-from scene.judging.codes import Code
+from scene.errors import Code
 from subterra_jax.host.files import require_folder
 
 SCHEMA = "subterra.dirty/3"

@@ -2,6 +2,7 @@
 
 The pipeline, a package each, in this order: `reading` the input, `poses` of its scans, `cleaning` of what is not the
 bore, `fitting` of axis, wall, lining and track, `judging` of the bore against all returns, `writing` of the folder.
+`build` runs it, `reconstruct` its part up to the bore. Where a build was killed, the next goes on from the poses.
 """
 
 import sys
@@ -16,21 +17,20 @@ from typing import Annotated
 import mujoco
 import tyro
 
-from scene.cleaning.clean import clean_cloud
-from scene.cleaning.crop import crop_cloud, describe_chainage, keep_stations, turn_round
+from scene.cleaning.clean import clean_cloud, crop_cloud, turn_round
 from scene.config import BuildConfig, ReconstructConfig, check_settings
-from scene.errors import FitError, RecordingError, require_input
+from scene.errors import Code, FitError, RecordingError, require_input
 from scene.fitting.assemble import describe_bore, fit_unfolded
 from scene.fitting.lining import add_lining
 from scene.fitting.rings import fit_ring_survey
 from scene.fitting.trackseen import find_track, measure_gauge
 from scene.inputs import hash_inputs
-from scene.judging.codes import Code
 from scene.judging.judge import Judgement, JudgingConfig, Warned, judge_bore, require_trust
 from scene.judging.page import render_page
 from scene.judging.returns import track_zone
 from scene.judging.sanity import doubt_bore, doubt_layers, doubt_track
 from scene.poses.calibration import UNCALIBRATED, Calibration, find_calibration
+from scene.poses.kept import find_kept, forget_kept, keep_placed, load_kept
 from scene.poses.place import Placed, place_cloud, place_recording
 from scene.progress import Stages
 from scene.reading.formats import describe, detect
@@ -77,12 +77,16 @@ def build(
     mounts = find_calibration(calibration)
     if reader is not None:
         load_module(reader)
+    inputs = [path for path in (source, *more, trajectory, control) if path is not None and path.exists()]
+    kept = find_kept(out, inputs, (config.reconstruct.voxel, config.reconstruct.reading, mounts, reader))
     started = time.monotonic()
     try:
         with Stages() as progress:
-            result = reconstruct(source, trajectory, config.reconstruct, progress, control, mounts, more)
+            result = reconstruct(source, trajectory, config.reconstruct, progress, control, mounts, more, kept)
             _print_time(started, f"bore: {result.bore.length:.2f} m, {result.facts['kind']}")
-            print(_describe_stations(result), flush=True)
+            x, y, z = result.bore.position[0] + result.origin
+            grow = result.facts["stations_grow"]
+            print(f"stations: 0 m at ({x:.1f}, {y:.1f}, {z:.1f}); they grow {grow}", flush=True)
             with _naming(source):
                 track = lay_track(result.bore, config.track, result.seen)
                 judgement = judge(result, track, config.judging)
@@ -90,11 +94,13 @@ def build(
                 with replace_folder(out) as folder:
                     write_folder(folder, name, result, track, judgement, config)
             _print_time(started, f"scene: written and compiled by MuJoCo {mujoco.__version__}")
-        _page_of_refusal(out).unlink(missing_ok=True)  # of an earlier try
     except FitError as error:
         if error.page:
             raise _leave_page(error, out) from error
+        forget_kept(out)
         raise
+    forget_kept(out)
+    _page_of_refusal(out).unlink(missing_ok=True)  # of an earlier try
     print(judgement.summary(), flush=True)
     laid = describe_track(track, result.seen)["laid"]
     print(f"track: {laid}" + ("; --track standard lays one" if "no rails" in laid else ""), flush=True)
@@ -112,10 +118,11 @@ def reconstruct(
     control: Path | None = None,
     calibration: Calibration = UNCALIBRATED,
     more: tuple[Path, ...] = (),
+    kept: Path | None = None,
 ) -> Reconstruction:
     """Detects the kind of an input, of any format that `scene.reading.formats` knows, and builds its bore.
 
-    Takes what `build` takes.
+    Takes what `build` takes; `kept` is where the registered cloud of a recording is kept for a build that is killed.
 
     Raises:
         RecordingError: Unreadable, or of no known kind.
@@ -135,13 +142,15 @@ def reconstruct(
             return _fit_rings(path, config, progress)
         if kind == "cloud":
             return _fit_cloud(place_cloud(path, *parts), config, progress)
-        placed = place_recording(path, trajectory, control, calibration, *parts, more)
+        placed = None if kept is None else load_kept(kept)
+        if placed is None:
+            placed = place_recording(path, trajectory, control, calibration, *parts, more)
+            if kept is not None:
+                keep_placed(kept, placed)
         try:
             return _fit_cloud(placed, config, progress)
-        except FitError as error:
-            if doubt := placed.facts.get("clock_doubt") or placed.facts.get(
-                "pose_doubt"
-            ):  # what no bore can be fitted to follows from it
+        except FitError as error:  # what no bore can be fitted to follows from poses that are in doubt
+            if doubt := placed.facts.get("clock_doubt") or placed.facts.get("pose_doubt"):
                 raise error.about(f"{doubt}; no bore can be fitted to them ({error})") from error
             raise
 
@@ -151,26 +160,29 @@ def _naming(source: Path) -> Iterator[None]:
     try:
         yield
     except FitError as error:
-        if str(source) in str(error):
-            raise
-        raise error.about(f"{source}: {error}") from error
+        raise error if str(source) in str(error) else error.about(f"{source}: {error}") from error
 
 
 _ARBITRARY = "arbitrarily: a registered cloud tells no direction, and --reverse turns it"
 
 
+def _describe_growth(config: ReconstructConfig, grows: str) -> dict[str, str]:
+    """Return the way that stations grow, in words, for the manifest; `grows` is the way without `--reverse`."""
+    return {"stations_grow": f"against this, by --reverse: {grows}" if config.extent.reverse else grows}
+
+
 def _fit_cloud(placed: Placed, config: ReconstructConfig, progress: Stages) -> Reconstruction:
+    """Cleans a registered cloud, and fits axis, wall, track and lining to what is left."""
     located = placed.located
     stage = progress.start("fitting the bore", 4)
     everything = crop_cloud(placed.cloud, config.extent.crop)
-    cleaned = clean_cloud(everything, config.cleaning, config.centreline)
+    cleaned = clean_cloud(everything, config.centreline)
     backwards = False
     if located is not None:
-        ends = cleaned.axis.local(located.trajectory.positions[[0, -1]] - everything.origin)[0]
+        ends = cleaned.axis.local(located.trajectory.positions[[0, -1]] - everything.origin).station
         backwards = bool(ends[1] < ends[0])  # stations grow the way the sensor went
     if backwards != config.extent.reverse:
         cleaned = turn_round(cleaned)
-    cleaned, everything, first = keep_stations(cleaned, everything, config.extent)
     cloud = cleaned.cloud
     stage.advance()
     sections, smooth = fit_unfolded(cloud, cleaned.axis, config.centreline.cutoff, cleaned.behind)
@@ -182,7 +194,7 @@ def _fit_cloud(placed: Placed, config: ReconstructConfig, progress: Stages) -> R
     facts = {
         "length_fixed_by": "registered cloud as given",
         **placed.facts,
-        **describe_chainage(config.extent, first, _ARBITRARY if located is None else "with the trajectory"),
+        **_describe_growth(config, _ARBITRARY if located is None else "with the trajectory"),
         "returns": cloud.returns,
         "points": len(cloud.points),
         "flat_floor": sections.flat_floor,
@@ -203,7 +215,7 @@ def _fit_rings(path: Path, config: ReconstructConfig, progress: Stages) -> Recon
         survey = survey.reversed()
     print(f"detected: {describe({'kind': 'ring survey', **survey.facts})}", flush=True)
     bore, origin, provenance, facts = fit_ring_survey(survey, config.lining)
-    facts |= describe_chainage(config.extent, 0.0, "with the order of the rings in the file")
+    facts |= _describe_growth(config, "with the order of the rings in the file")
     return Reconstruction(bore, origin, hash_inputs([path], progress), facts, provenance)
 
 
@@ -255,14 +267,6 @@ def _leave_page(error: FitError, out: Path) -> FitError:
     return error.about(f"{error} ({_page_of_refusal(out)} shows why)")
 
 
-def _describe_stations(result: Reconstruction) -> str:
-    """Return where the stations begin and which way they grow, for people."""
-    x, y, z = result.bore.position[0] + result.origin
-    start = float(result.facts["chainage_start"])
-    chainage = f", chainage {start:g} m" if start else ""
-    return f"stations: 0 m{chainage} at ({x:.1f}, {y:.1f}, {z:.1f}); they grow {result.facts['chainage_grows']}"
-
-
 def _print_time(started: float, text: str) -> None:
     print(f"[{time.monotonic() - started:6.1f} s] {text}", flush=True)
 
@@ -305,9 +309,9 @@ def main() -> int:
         try:
             wanted()
         except FitError as error:
-            raise error.about(f"{error} [{error.code}]" if error.code else str(error)) from error
+            raise error.about(f"{error} [{error.code}]") from error
 
-    return run_command(act, "interrupted; the output is as it was")
+    return run_command(act, "interrupted; the output is as it was, and the same command goes on")
 
 
 if __name__ == "__main__":

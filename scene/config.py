@@ -4,8 +4,7 @@ import math
 from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any
 
-from scene.cleaning.clean import CleaningConfig
-from scene.cleaning.crop import ExtentConfig
+from scene.cleaning.clean import ExtentConfig
 from scene.fitting.centreline import CentrelineConfig
 from scene.fitting.lining import LiningConfig
 from scene.judging.judge import JudgingConfig
@@ -22,7 +21,6 @@ class ReconstructConfig:
     voxel: float = 0.04  # Thinning of the cloud, m.
     reading: ReadingConfig = field(default_factory=ReadingConfig)  # What the user says instead of having it detected.
     extent: ExtentConfig = field(default_factory=ExtentConfig)  # Part that is built, and how its stations count.
-    cleaning: CleaningConfig = field(default_factory=CleaningConfig)  # Search for what is not the bore.
     centreline: CentrelineConfig = field(default_factory=CentrelineConfig)  # Search for the axis.
     lining: LiningConfig = field(default_factory=LiningConfig)  # Lining by standard, where the survey can show none.
 

@@ -1,14 +1,33 @@
 """Curves and sections: a centreline by arc length, and a section as a polygon in polar form about it."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
 _VERTICAL = np.array([0.0, 0.0, 1.0])
 _BEND_OVER = 10.0  # m
+
+
+class Around(NamedTuple):
+    """Points about an axis."""
+
+    station: Float[np.ndarray, " n"]  # m
+    lateral: Float[np.ndarray, " n"]  # To the left of the axis, m
+    upward: Float[np.ndarray, " n"]  # Above the axis, m
+
+    @property
+    def angle(self) -> Float[np.ndarray, " n"]:
+        """Direction from the axis, rad."""
+        return np.arctan2(self.upward, self.lateral)
+
+    @property
+    def radius(self) -> Float[np.ndarray, " n"]:
+        """Distance from the axis, m."""
+        return np.hypot(self.lateral, self.upward)
 
 
 @dataclass(frozen=True)
@@ -63,15 +82,15 @@ class Axis:
         flat = tangent / np.linalg.norm(tangent, axis=1, keepdims=True)
         return make_axis(self.station, self.position * [1.0, 1.0, 0.0], flat)
 
-    def local(self, points: Float[np.ndarray, "p 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return station, lateral and upward offset of points from the nearest sample of the axis, m, `(p,)` each."""
+    def local(self, points: Float[np.ndarray, "p 3"]) -> Around:
+        """Return points about the nearest samples of the axis."""
         nearest = cKDTree(self.position).query(points, workers=-1)[1]
         offset = points - self.position[nearest]
 
         def along(directions: np.ndarray) -> np.ndarray:
             return np.einsum("ij,ij->i", offset, directions[nearest])
 
-        return self.station[nearest] + along(self.tangent), along(self.lateral), along(self.up)
+        return Around(self.station[nearest] + along(self.tangent), along(self.lateral), along(self.up))
 
 
 def make_axis(station: np.ndarray, position: np.ndarray, tangent: np.ndarray) -> Axis:
@@ -142,6 +161,12 @@ def wall_at(side: int, across: np.ndarray, along: np.ndarray, at: np.ndarray) ->
     half = np.sign(across) == side
     order = np.argsort(along[half], kind="stable")
     return np.interp(at, along[half][order], across[half][order])
+
+
+def find_runs(held: Bool[np.ndarray, " n"]) -> Int[np.ndarray, "k 2"]:
+    """Return first and last row of each run of rows that hold."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], held.astype(int), [0]])))
+    return edges.reshape(-1, 2) - [0, 1]
 
 
 def bin_angles(count: int) -> Float[np.ndarray, " m"]:

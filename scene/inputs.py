@@ -14,7 +14,7 @@ _CHUNK = 1 << 22
 
 def total_bytes(paths: list[Path]) -> int:
     """Return the bytes of all inputs, a folder's files included."""
-    return sum(file.stat().st_size for path in paths for file in _files(path))
+    return sum(file.stat().st_size for path in paths for file in input_files(path))
 
 
 def input_record(paths: list[Path], advance: Callable[[int], None] = lambda _: None) -> list[dict[str, Any]]:
@@ -40,7 +40,8 @@ def library_versions(names: tuple[str, ...]) -> dict[str, str]:
     return found
 
 
-def _files(path: Path) -> list[Path]:
+def input_files(path: Path) -> list[Path]:
+    """Return the files of an input: those of a folder, or itself."""
     return [file for file in sorted(path.iterdir()) if file.is_file()] if path.is_dir() else [path]
 
 
@@ -58,7 +59,7 @@ def _file_record(path: Path, advance: Callable[[int], None]) -> dict[str, Any]:
 
 
 def _folder_record(path: Path, advance: Callable[[int], None]) -> dict[str, Any]:
-    records = [_file_record(file, advance) for file in _files(path)]
+    records = [_file_record(file, advance) for file in input_files(path)]
     digest = hashlib.sha256("".join(f"{r['file']} {r['sha256']}\n" for r in records).encode())
     size = sum(record["bytes"] for record in records)
     return {"folder": path.name, "files": len(records), "bytes": size, "sha256": digest.hexdigest()}

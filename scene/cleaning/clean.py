@@ -1,25 +1,25 @@
-"""The steps of cleaning, in order: leave out strays, look for places inside a bore, follow it, sort the returns.
+"""The steps of cleaning: crop, leave out strays, look for places inside a bore, follow it, sort the returns.
 
 A cloud in which no bore can be seen is refused by the name of what it is.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
 import tyro
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from scipy.ndimage import maximum_filter1d
 from scipy.spatial import cKDTree
 
+from scene.cleaning import sort
 from scene.cleaning.follow import N_RAYS, Course, Seed, find_seeds, follow_bore, join_courses
 from scene.cleaning.planes import find_plane_walls
-from scene.cleaning.removed import Cause, Cleaned, list_removed, part_of_cloud
-from scene.cleaning.sort import end_stations, has_support, look_around, name_bodies, sort_points
+from scene.cleaning.sort import Cleaned, look_around, part_of_cloud, sort_points
 from scene.cleaning.tube import Tube, measure_tube
 from scene.cloud import Cloud, thin_and_count
-from scene.errors import FitError, Refusal
+from scene.errors import Cause, FitError, Refusal
 from scene.fitting.centreline import CentrelineConfig, centre_axis, smooth_axis
 from scene.geometry import Axis, bin_angles
 
@@ -36,20 +36,61 @@ _FLAG = tyro.conf.arg(prefix_name=False)
 
 
 @dataclass(frozen=True)
-class CleaningConfig:
-    """Settings of the search for what is not the bore."""
+class ExtentConfig:
+    """The part of an input that is built, and how its stations count."""
 
-    strict: Annotated[bool, _FLAG] = False  # Refuse a cloud with a branch.
-    filter_outliers: Annotated[bool, _FLAG] = True  # Leave out scattered returns without neighbours.
-    filter_moving: Annotated[bool, _FLAG] = True  # Leave out what moved or stands inside: people, trails, vehicles.
+    # Box in the input's frame, m, that is kept: x,y,z,x,y,z of two corners, or x,y,x,y in plan.
+    crop: Annotated[str | None, _FLAG] = None
+    reverse: Annotated[bool, _FLAG] = False  # Count stations from the other end.
 
 
-def clean_cloud(cloud: Cloud, config: CleaningConfig, centreline: CentrelineConfig) -> Cleaned:
+def parse_box(text: str) -> Float[np.ndarray, "2 3"]:
+    """Return the corners of a box, lower first, m; infinite in height where only the plan is given.
+
+    Raises `FitError` for a text that is neither four nor six numbers, or a box without a volume.
+    """
+    try:
+        numbers = np.array([float(word) for word in text.replace(",", " ").split()])
+    except ValueError:
+        numbers = np.empty(0)
+    if len(numbers) not in (4, 6) or not np.isfinite(numbers).all():
+        raise FitError(f"--crop is x,y,z,x,y,z of two corners or x,y,x,y in plan, in m, got {text!r}", Refusal.CROP)
+    pair = np.sort(numbers.reshape(2, -1), axis=0)
+    corners = np.array([[-np.inf] * 3, [np.inf] * 3])
+    corners[:, : pair.shape[1]] = pair
+    if (corners[0] >= corners[1]).any():
+        raise FitError(f"--crop {text}: the box is empty", Refusal.CROP)
+    return corners
+
+
+def crop_cloud(cloud: Cloud, crop: str | None) -> Cloud:
+    """Return the points of a cloud inside a box of the input's frame; all where there is none.
+
+    Raises `FitError` where the box is none, or holds no point.
+    """
+    if crop is None:
+        return cloud
+    low, high = parse_box(crop) - cloud.origin
+    rows = np.flatnonzero(((cloud.points >= low) & (cloud.points <= high)).all(axis=1))
+    if not len(rows):
+        lowest, highest = (f(cloud.points, axis=0) + cloud.origin for f in (np.min, np.max))
+        spans = ", ".join(f"{a} {x:.1f} to {y:.1f}" for a, x, y in zip("xyz", lowest, highest, strict=True))
+        raise FitError(f"--crop {crop} holds no point; the cloud spans {spans} m", Refusal.CROP)
+    return part_of_cloud(cloud, rows)
+
+
+def turn_round(cleaned: Cleaned) -> Cleaned:
+    """Return the same cloud with an axis that runs the other way."""
+    removed = tuple(part.reversed(cleaned.axis.length) for part in reversed(cleaned.removed))
+    return replace(cleaned, axis=cleaned.axis.reversed(), removed=removed)
+
+
+def clean_cloud(cloud: Cloud, centreline: CentrelineConfig) -> Cleaned:
     """Finds the axis of the bore in a registered cloud and cuts away what does not belong to it.
 
-    Raises `FitError` where no bore can be seen, naming the cause, and with `config.strict` where it has a branch.
+    Raises `FitError` where no bore can be seen, naming the cause.
     """
-    supported = has_support(cloud.points)
+    supported = sort.has_support(cloud.points)
     thinned, count = thin_and_count(part_of_cloud(cloud, np.flatnonzero(supported)), _COARSE)
     coarse = thinned.astype(np.float64)
     if len(coarse) < _FEWEST:
@@ -69,7 +110,7 @@ def clean_cloud(cloud: Cloud, config: CleaningConfig, centreline: CentrelineConf
     points = cloud.points.astype(np.float64)
     around = look_around(points, axis)
     behind, cause = sort_points(around, tube, supported, ends)
-    cause = _filter(name_bodies(points, cause, behind, supported), config)
+    cause = sort.name_bodies(points, cause, behind, supported)
     if (cause != Cause.KEPT).mean() < _LITTLE:
         cause[:] = Cause.KEPT
     kept = cloud if (cause == Cause.KEPT).all() else part_of_cloud(cloud, np.flatnonzero(cause == Cause.KEPT))
@@ -78,20 +119,8 @@ def clean_cloud(cloud: Cloud, config: CleaningConfig, centreline: CentrelineConf
     hidden = along.position + tube.behind[:, 1:2] * along.lateral + tube.behind[:, 2:] * along.up
     axis = axis.at(np.linspace(*ends, int(np.ptp(ends)) + 1))
     axis = centre_axis(kept.points, axis, centreline, usual)
-    removed = list_removed(cloud, cause, look_around(points, axis).station, _STRETCH, behind)
-    warning = next((part.warning for part in removed if part.warning), "")
-    if config.strict and warning:
-        raise FitError(warning, Refusal.BRANCH)
+    removed = sort.list_removed(cloud, cause, look_around(points, axis).station, _STRETCH, behind)
     return Cleaned(kept, axis, removed, cause, hidden)
-
-
-def _filter(cause: Int[np.ndarray, " n"], config: CleaningConfig) -> Int[np.ndarray, " n"]:
-    """Return the causes with those that the user wants kept as the bore's."""
-    moving = config.filter_moving
-    out = {Cause.SCATTERED: config.filter_outliers, Cause.INSIDE: moving, Cause.STANDING: moving}
-    result = cause.copy()
-    result[np.isin(cause, [kind for kind, leave in out.items() if not leave])] = Cause.KEPT
-    return result
 
 
 def _sorted_coarse(
@@ -102,9 +131,9 @@ def _sorted_coarse(
     `count` is the number of points that each coarse point stands for.
     """
     around = look_around(coarse, axis)
-    tube = measure_tube(around.station, around.angle, around.radius, count, axis.length, reach)
+    tube = measure_tube(around, count, axis.length, reach)
     tube = find_plane_walls(tube, around)
-    ends = end_stations(tube, around)
+    ends = sort.end_stations(tube, around)
     return tube, ends, sort_points(around, tube, np.ones(len(coarse), bool), ends)[1] == Cause.KEPT
 
 

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import maximum_filter1d, median_filter, uniform_filter1d
 
-from scene.cleaning.sort import Around
 from scene.cleaning.tube import Tube
+from scene.geometry import Around
 
 _FLAT = 0.15  # m that a ceiling or a floor departs from its height, of most directions
 _INNER = 0.6  # of the half width: so much of ceiling and floor must be flat

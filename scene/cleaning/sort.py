@@ -1,6 +1,7 @@
-"""Sorts returns by where they lie about a bore: on its wall, inside, behind, beyond its mouths, or alone."""
+"""Sorts returns by where they lie about a bore: on its wall, inside, behind, beyond its mouths, alone; lists cuts."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -9,9 +10,10 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from scene.cleaning.removed import Cause
 from scene.cleaning.tube import Tube
-from scene.geometry import Axis, angle_bins
+from scene.cloud import Cloud
+from scene.errors import Cause
+from scene.geometry import Around, Axis, angle_bins
 
 _OVERRUN = 60.0  # m beyond the axis that points have stations
 _BEHIND = 0.45  # m behind the wall: further is no recess of a lining
@@ -29,28 +31,9 @@ _ABOVE_SPRINGING, _MIN_ABOVE = 0.3, 8  # sine of the direction; directions
 _ELSEWHERE = 4.0  # times the wall
 
 
-@dataclass(frozen=True)
-class Around:
-    """Points about an axis."""
-
-    station: Float[np.ndarray, " n"]  # m
-    lateral: Float[np.ndarray, " n"]  # m
-    upward: Float[np.ndarray, " n"]  # m
-
-    @property
-    def angle(self) -> Float[np.ndarray, " n"]:
-        """Direction from the axis, rad."""
-        return np.arctan2(self.upward, self.lateral)
-
-    @property
-    def radius(self) -> Float[np.ndarray, " n"]:
-        """Distance from the axis, m."""
-        return np.hypot(self.lateral, self.upward)
-
-
 def look_around(points: Float[np.ndarray, "n 3"], axis: Axis) -> Around:
     """Return points about an axis that runs on straight beyond its ends."""
-    return Around(*axis.at(np.arange(-_OVERRUN, axis.length + _OVERRUN, 0.25)).local(points))
+    return axis.at(np.arange(-_OVERRUN, axis.length + _OVERRUN, 0.25)).local(points)
 
 
 def end_stations(tube: Tube, around: Around) -> tuple[float, float]:
@@ -67,9 +50,8 @@ def end_stations(tube: Tube, around: Around) -> tuple[float, float]:
     first, last = tube.grid.start, tube.grid.start + tube.grid.rows * tube.grid.step
     if not len(full):
         return first, last
-    angle, radius = around.angle, around.radius
-    out, _ = tube.off(around.station, angle, radius)
-    column = angle_bins(angle, tube.grid.columns)
+    out, _ = tube.off(around)
+    column = angle_bins(around.angle, tube.grid.columns)
     on = (out < _BEHIND) & decide[column]
 
     def outermost(end: float, way: int) -> float:
@@ -96,20 +78,19 @@ def sort_points(
     around: Around, tube: Tube, supported: Bool[np.ndarray, " n"], ends: tuple[float, float]
 ) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, " n"]]:
     """Return how far each point is behind the wall, m, and its `Cause`."""
-    angle, radius = around.angle, around.radius
-    out, within = tube.off(around.station, angle, radius)
-    cause = np.full(len(radius), Cause.KEPT, np.int8)
+    out, within = tube.off(around)
+    cause = np.full(len(out), Cause.KEPT, np.int8)
     cause[out > _BEHIND] = Cause.BEHIND
     height = _height_above_floor(around, tube)
     inside = (within > _INSIDE) & (height > _TRACK)
     cause[inside] = Cause.INSIDE
     cause[_footprint(around, inside & (height < _TRACK + _FOOT)) & (height > _ABOVE) & (within > _ALONE)] = Cause.INSIDE
-    standing = tube.before_plane(around.station, angle) & (within > _ALONE) & (height > _ABOVE)
+    standing = tube.before_plane(around) & (within > _ALONE) & (height > _ABOVE)
     cause[standing] = Cause.STANDING
     cause[~supported & (np.maximum(out, within) > _ALONE)] = Cause.SCATTERED
     beyond = (around.station < ends[0]) | (around.station > ends[1])
     cause[beyond] = Cause.BEYOND
-    cause[~beyond & supported & (radius > _ELSEWHERE * np.median(tube.wall))] = Cause.ELSEWHERE
+    cause[~beyond & supported & (around.radius > _ELSEWHERE * np.median(tube.wall))] = Cause.ELSEWHERE
     return out, cause
 
 
@@ -197,3 +178,94 @@ def name_bodies(
     stays = (cause[off] == Cause.BEYOND) & (named[of_point] != Cause.ELSEWHERE)
     result[off] = np.where(stays, Cause.BEYOND, named[of_point])
     return result
+
+
+_ROOT = 20  # percent of a branch's points, those nearest the bore, that are its mouth
+_BRANCH = 3.0  # m behind the wall: less is a niche
+_BUILDING = 2000  # points
+
+
+@dataclass(frozen=True)
+class Removed:
+    """One stretch of the cloud that was cut away.
+
+    Stations below 0 or above the bore's length lie beyond its ends.
+    """
+
+    start: float  # First station, m
+    end: float  # Last station, m
+    cause: Cause
+    points: int  # Points of the thinned cloud in it
+    place: tuple[float, float, float]  # Its middle, of a branch that of its mouth, in the input's frame, m
+    nearest: float = 0.0  # How far behind the wall it begins, m
+    deepest: float = 0.0  # How far behind the wall it ends, m
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """Entries for the manifest."""
+        return {**vars(self), "cause": self.cause.words, "code": self.cause.name.lower(), "warning": self.warning}
+
+    @property
+    def warning(self) -> str:
+        """Sentence for the user; empty where the cut is usual."""
+        x, y, z = self.place
+        where = f"from station {self.start:.0f} to {self.end:.0f} m, near ({x:.1f}, {y:.1f}, {z:.1f}),"
+        if self.cause == Cause.BRANCH and self.deepest > _BRANCH:
+            return (
+                f"{where} the bore opens into a branch or a room that reaches {self.deepest:.0f} m behind its wall; "
+                "it was cut at its mouth: build it from a cloud of its own"
+            )
+        if self.cause == Cause.ELSEWHERE and self.points > _BUILDING:
+            return f"{where} another tunnel or building stands {self.nearest:.0f} m behind the wall; it was left out"
+        return ""
+
+    def shifted(self, by: float) -> "Removed":
+        return replace(self, start=self.start + by, end=self.end + by)
+
+    def reversed(self, length: float) -> "Removed":
+        """Return the same stretch by stations that count from the other end of an axis of `length`, m."""
+        return replace(self, start=length - self.end, end=length - self.start)
+
+
+@dataclass(frozen=True)
+class Cleaned:
+    """The returns of one bore, and what was cut away."""
+
+    cloud: Cloud  # The bore's returns; the same object as the input where nothing was cut
+    axis: Axis  # Centreline of the bore, m
+    removed: tuple[Removed, ...]  # By station of `axis`, m
+    cause: Int[np.ndarray, " n"]  # `Cause` of each point of the uncleaned cloud
+    behind: Float[np.ndarray, "k 3"]  # Places on plane walls, where things may hide them, m
+
+
+def part_of_cloud(cloud: Cloud, rows: Int[np.ndarray, " k"]) -> Cloud:
+    """Return some of a cloud's points; the number of returns read stays what it was."""
+    return replace(cloud, points=cloud.points[rows], weights=cloud.weights[rows])
+
+
+def list_removed(
+    cloud: Cloud,
+    cause: Int[np.ndarray, " n"],
+    station: Float[np.ndarray, " n"],
+    gap: float,
+    behind: Float[np.ndarray, " n"] | None = None,
+) -> tuple[Removed, ...]:
+    """List stretches of points with one cause, no two points of a stretch further apart than `gap` along it, m.
+
+    `behind` is how far each point is behind the wall, m; what a user should know of gets a warning by it.
+    """
+    result = []
+    for index in np.unique(cause[cause != Cause.KEPT]):
+        rows = np.flatnonzero(cause == index)
+        rows = rows[np.argsort(station[rows], kind="stable")]
+        for part in np.split(rows, np.flatnonzero(np.diff(station[rows]) > gap) + 1):
+            named, depth = part, np.zeros(2)
+            if behind is not None:
+                depth = np.percentile(behind[part], [1, 99])
+                if index == Cause.BRANCH:  # one goes to its mouth to look, and not to the middle of what was cut
+                    named = part[behind[part] <= np.percentile(behind[part], _ROOT)]
+            x, y, z = (float(v) for v in np.median(cloud.points[named].astype(np.float64), axis=0) + cloud.origin)
+            first, last = (float(station[part[end]]) for end in (0, -1))
+            depths = float(depth[0]), float(depth[1])
+            result.append(Removed(first, last, Cause(index), len(part), (x, y, z), *depths))
+    return tuple(sorted(result, key=lambda part: (part.start, part.cause)))

@@ -10,17 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.ndimage import (
-    binary_closing,
-    binary_opening,
-    label,
-    maximum_filter,
-    minimum_filter,
-    uniform_filter1d,
-)
+from scipy.ndimage import binary_closing, binary_opening, label, maximum_filter, minimum_filter, uniform_filter1d
 
 from scene.fitting.unroll import Grid, fill_nearest, fill_sides
-from scene.geometry import bin_angles
+from scene.geometry import Around, bin_angles
 
 ROW = 0.5  # m
 _OVERRUN = 4.0  # m beyond the axis that may still be bore
@@ -52,34 +45,27 @@ class Tube:
     plane: Bool[np.ndarray, "rows cols"]  # A plane wall, before which things may stand
     behind: Float[np.ndarray, "k 3"]  # Station, lateral and upward offset of places on such walls, m
 
-    def off(
-        self, station: Float[np.ndarray, " n"], angle: Float[np.ndarray, " n"], radius: Float[np.ndarray, " n"]
-    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    def off(self, around: Around) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
         """Return how far points are behind the wall of the cells around theirs, and how far inside, m; negative if not.
 
         Beyond the ends the last row counts.
         """
-        cell = self._cell(station, angle)
+        cell, radius = self._cell(around), around.radius
         furthest = maximum_filter(self.wall, 3, mode=("nearest", "wrap")).ravel()[cell]
         nearest = minimum_filter(self.wall, 3, mode=("nearest", "wrap")).ravel()[cell]
         return radius - furthest, nearest - radius
 
-    def before_plane(self, station: Float[np.ndarray, " n"], angle: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+    def before_plane(self, around: Around) -> Bool[np.ndarray, " n"]:
         """Return which points lie in a direction in which things hide a plane wall."""
-        return self.plane.ravel()[self._cell(station, angle)]
+        return self.plane.ravel()[self._cell(around)]
 
-    def _cell(self, station: Float[np.ndarray, " n"], angle: Float[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+    def _cell(self, around: Around) -> Int[np.ndarray, " n"]:
         end = self.grid.start + self.grid.rows * self.grid.step
-        return self.grid.cell(np.clip(station, self.grid.start, end - 1e-6), angle)
+        return self.grid.cell(np.clip(around.station, self.grid.start, end - 1e-6), around.angle)
 
 
 def measure_tube(
-    station: Float[np.ndarray, " n"],
-    angle: Float[np.ndarray, " n"],
-    radius: Float[np.ndarray, " n"],
-    count: Float[np.ndarray, " n"],
-    length: float,
-    reach: Float[np.ndarray, " rays"],
+    around: Around, count: Float[np.ndarray, " n"], length: float, reach: Float[np.ndarray, " rays"]
 ) -> Tube:
     """Return the wall that persists along an axis of some length, m.
 
@@ -87,7 +73,8 @@ def measure_tube(
     spaced directions, m: what persists further out is the wall of another tunnel.
     """
     grid = Grid.over(-_OVERRUN, length + _OVERRUN, ROW, COLUMNS)
-    cell = grid.cell(station, angle)
+    angle, radius = around.angle, around.radius
+    cell = grid.cell(around.station, angle)
     rays = bin_angles(len(reach))
     good = (cell >= 0) & (radius < np.interp(angle, rays, reach, period=2 * np.pi))
     bins = int(np.ceil(reach.max() / _BIN)) + 1

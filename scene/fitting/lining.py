@@ -131,15 +131,6 @@ def pair_pockets(bore: Bore, joint: Float[np.ndarray, " r"] | None = None) -> In
     return np.array(result, np.intp).reshape(-1, 2)
 
 
-def count_alone(bore: Bore, joint: Float[np.ndarray, " r"] | None = None) -> dict[str, int]:
-    """Count the pockets that no nail joins to the next one of their joint, by why; see `pair_pockets` for `joint`."""
-    pairs = len(pair_pockets(bore, joint))
-    return {
-        "no pocket across the joint": len(bore.pocket) - 2 * pairs,
-        "seen to have no nail": 2 * (pairs - len(bore.nail)),
-    }
-
-
 def make_nails(bore: Bore, pair: Int[np.ndarray, "b 2"], depth: float, diameter: float) -> Shaped[np.ndarray, " b"]:
     """Makes nails from the middle of one pocket to that of the other, marked as not measured."""
     first, second = bore.pocket[pair[:, 0]], bore.pocket[pair[:, 1]]
@@ -237,7 +228,6 @@ class LiningConfig:
     # Angle below the horizontal beyond which universal rings show no pockets, rad. Ours: there a filling carries the
     # track.
     filled_angle: float = 0.90
-    stagger: float = 0.0  # Shift of every second joint's pockets, as a share of their spacing; 0 for straight rows.
     nail_diameter: float = 0.027  # Diameter of a nail, m. Source: bolts M24 to M30.
     nail_depth: float = 0.06  # Depth of its axis behind the wall, m. An assumption: mid-pocket.
 
@@ -326,10 +316,8 @@ def _standard_pockets(
 ) -> Shaped[np.ndarray, " p"]:
     """Pockets on both sides of each joint, in rows."""
     rows = np.linspace(-config.clock_angle, np.pi + config.clock_angle, max(config.pockets_per_ring, 1))
-    spacing = rows[1] - rows[0] if len(rows) > 1 else 0.0
-    turn = np.where(np.arange(len(joints)) % 2 == 1, config.stagger * spacing, 0.0)
     station = joints[:, None, None] + config.pocket_offset * np.array([-1.0, 1.0])[None, :, None] + 0 * rows
-    angle = rows[None, None] + turn[:, None, None] + 0 * station
+    angle = rows + 0 * station
     return _make_pockets(bore, station.ravel(), angle.ravel(), config, flat_floor)
 
 

@@ -4,103 +4,18 @@ A pocket is a hole in the returns that lie on the wall, with returns behind it. 
 hidden by its own edge, so that one pocket says little about its depth or size. But the pockets of a lining come from
 one mould, and all of them together say it well. They stand in rows along the bore, either side of every ring joint.
 Pockets of turned rings stand in no rows and are not looked for.
-
-Ring joints show by steps, too: segments stand a few millimetres apart. One step is lost in the noise. But rings are
-alike in length, so that the mean square of all steps, folded to one ring, peaks at the joint, whatever segments and
-pockets do. A joint is known where that place beats every other, ring by ring, by more than chance.
 """
 
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
-from scipy.ndimage import binary_dilation, maximum_filter, uniform_filter, uniform_filter1d
+from scipy.ndimage import maximum_filter, uniform_filter
 from scipy.spatial import cKDTree
 
 from scene.bore import POCKET
-from scene.fitting.evidence import more_than_chance, odds_by_place, open_rims, pocket_over_wall
-from scene.fitting.mould import (
-    CLEAR,
-    MIN_DEPTH,
-    MODES,
-    Holes,
-    common_depth,
-    common_size,
-    refine_positions,
-    slopes,
-)
+from scene.fitting import evidence
+from scene.fitting.evidence import CLEAR, MIN_DEPTH, MODES, Holes
 from scene.fitting.section import Sections
 from scene.fitting.unroll import Grid
-
-_BEFORE = 0.4  # m before and behind a place, over which the wall is averaged
-_STEPS_AROUND = 9  # columns over which steps are averaged: far less than a segment
-_MIN_WEIGHT = 6.0  # returns before and behind, at most 50 of a cell
-_MOST = 0.02  # m, more than segments stand apart
-_BIN = 0.05  # m along a ring
-_RIVAL = 0.3  # m from the joint: other places in a ring
-_MIN_T = 4.0  # Student's t of the joint against each of them
-_PEAK = 0.15  # m about the fullest place, over which it is centred
-
-
-def find_joints_by_steps(
-    sections: Sections, hole: Bool[np.ndarray, "rows cols"], pitch: float
-) -> Float[np.ndarray, " r"]:
-    """Finds the stations of the ring joints from the start of the grid, m; empty where steps do not tell them.
-
-    `hole` are cells of pockets and other holes, whose rims would be steps; `pitch` is the length of a ring, m.
-    """
-    grid = sections.grid
-    station, step = _mean_square_steps(sections, ~hole)
-    bins = max(round(pitch / _BIN), 8)
-    ring = np.floor(station / pitch).astype(int)
-    place = np.minimum((np.mod(station, pitch) / pitch * bins).astype(int), bins - 1)
-    rows = ring.max(initial=-1) + 1
-    cell, known = ring * bins + place, np.isfinite(step)
-    count = np.bincount(cell[known], minlength=rows * bins).reshape(rows, bins)
-    total = np.bincount(cell[known], step[known], rows * bins).reshape(rows, bins)
-    if rows < 2 or not (count.sum(axis=0) > 0).all():
-        return np.empty(0)
-    mean = total.sum(axis=0) / count.sum(axis=0)
-    best = int(np.argmax(mean))
-    apart = (np.mod(np.arange(bins) - best + bins / 2, bins) - bins / 2) * pitch / bins
-    each = np.where(count > 0, total / np.maximum(count, 1), np.nan)
-    if min(_student(each[:, best] - each[:, rival]) for rival in np.flatnonzero(np.abs(apart) >= _RIVAL)) < _MIN_T:
-        return np.empty(0)
-    near = np.abs(apart) < _PEAK
-    above = np.maximum(mean[near] - np.median(mean), 0.0)
-    joint = (best + 0.5) * pitch / bins + float(above @ apart[near] / above.sum())
-    return np.arange(joint % pitch, grid.rows * grid.step, pitch)
-
-
-def _student(difference: Float[np.ndarray, " r"]) -> float:
-    """Return Student's t of a mean that differs from 0; 0 for fewer than three values."""
-    difference = difference[np.isfinite(difference)]
-    if len(difference) < 3:
-        return 0.0
-    return float(difference.mean() / (difference.std(ddof=1) + 1e-12) * np.sqrt(len(difference)))
-
-
-def _mean_square_steps(
-    sections: Sections, use: Bool[np.ndarray, "rows cols"]
-) -> tuple[Float[np.ndarray, " e"], Float[np.ndarray, " e"]]:
-    """Return edges between rows, m from the start of the grid, and the mean square step of the wall there, m².
-
-    It is NaN where too little was seen.
-    """
-    n = round(_BEFORE / sections.grid.step)
-    weight = np.where(sections.inlier & use, np.minimum(sections.weight, 50.0), 0.0)
-    wall = sections.radius + sections.residual
-    padded = [np.pad(field.cumsum(axis=0), ((1, 0), (0, 0))) for field in (weight, weight * wall)]
-    edge = np.arange(n, sections.grid.rows - n + 1)
-    before, ahead = ([field[e + n] - field[e] for field in padded] for e in (edge - n, edge))
-    seen = (before[0] > _MIN_WEIGHT) & (ahead[0] > _MIN_WEIGHT)
-    step = ahead[1] / np.maximum(ahead[0], 1e-9) - before[1] / np.maximum(before[0], 1e-9)
-    sure = np.where(seen, before[0] * ahead[0] / np.maximum(before[0] + ahead[0], 1e-9), 0.0)
-    total = uniform_filter1d(sure, _STEPS_AROUND, axis=1, mode="wrap")
-    around = uniform_filter1d(sure * step, _STEPS_AROUND, axis=1, mode="wrap") / np.maximum(total, 1e-9)
-    known = total > _MIN_WEIGHT
-    square = np.where(known, np.clip(around, -_MOST, _MOST) ** 2, 0.0).sum(axis=1)
-    enough = known.sum(axis=1) > sections.grid.columns / 4
-    return edge * sections.grid.step, np.where(enough, square / np.maximum(known.sum(axis=1), 1), np.nan)
-
 
 _ROW_SHARE = 0.3  # of the fullest row, and of the places in a row
 _PITCHES = (0.9, 2.1)  # widths of rings in use, m
@@ -193,9 +108,6 @@ _MIN_SEEN = 0.6  # of the wall
 _NOISE_SHARE = 0.25  # of the depth
 _RIB = 0.02  # least wall left between two pockets, and before a mouth, m
 _OPEN_RIM, _USUAL_RIM = 0.35, 0.15  # share of the wall missing around one hole that is no pocket, and around the usual
-_RIMS = (11, 9)  # cells about the middle of a hole that are it or its rim
-_THROUGH = 0.05  # of the pockets
-_SAME_JOINT = 0.1  # m
 
 
 def find_pockets(sections: Sections) -> tuple[Shaped[np.ndarray, " p"], Float[np.ndarray, " r"]]:
@@ -209,16 +121,6 @@ def find_pockets(sections: Sections) -> tuple[Shaped[np.ndarray, " p"], Float[np
     weak = faint.where(faint.score > _WEAK)
     reach = _ROW_WIDTH / (2 * np.pi * np.median(sections.radius) / sections.grid.columns)
     rows = keep_rows(weak, sections.grid.columns, reach)
-    pockets, joints = _pockets_in_rows(deficit, sections, faint, rows, reach)
-    if not len(pockets):
-        return pockets, joints
-    return pockets, _correct_joints(joints, _joints_by_steps(sections, weak, pockets, float(np.diff(joints).mean())))
-
-
-def _pockets_in_rows(
-    deficit: np.ndarray, sections: Sections, faint: Holes, rows: Holes, reach: float
-) -> tuple[Shaped[np.ndarray, " p"], Float[np.ndarray, " r"]]:
-    """Return the pockets in rows, and the joints in the middle of those either side; none where it could be chance."""
     nothing = np.empty(0, POCKET), np.empty(0)
     if len(rows.row) < _MIN_POCKETS:
         return nothing
@@ -227,19 +129,20 @@ def _pockets_in_rows(
         return nothing
     joints = find_ring_joints(pockets["station"], sections.grid.rows * sections.grid.step)
     radius = float(np.median(sections.radius))
-    return (pockets, joints) if more_than_chance(pockets, joints, _PITCHES, radius) else nothing
+    return (pockets, joints) if evidence.more_than_chance(pockets, joints, _PITCHES, radius) else nothing
 
 
 def _keep_likely(deficit: np.ndarray, sections: Sections, holes: Holes) -> tuple[Holes, Float[np.ndarray, " k"]]:
     """Return the holes that are likelier pockets like the clear ones than wall, and the odds of it, as a logarithm."""
     grid, clear = sections.grid, holes.score > CLEAR
-    row, column = refine_positions(deficit, sections, holes)
+    row, column = evidence.refine_positions(deficit, sections, holes)
     middle = Holes(np.rint(row).astype(np.intp), np.rint(column).astype(np.intp), holes.score)
-    odds = pocket_over_wall(sections, middle, common_size(deficit, sections, holes, slopes(sections, holes)))
+    size = evidence.common_size(deficit, sections, holes, evidence.slopes(sections, holes))
+    odds = evidence.pocket_over_wall(sections, middle, size)
     if clear.any():
         station = (row + 0.5) * grid.step
         joints = find_ring_joints(station[clear], grid.rows * grid.step)
-        odds = odds_by_place(odds, station, float(np.median(np.diff(joints)))) if len(joints) > 1 else odds
+        odds = evidence.odds_by_place(odds, station, float(np.median(np.diff(joints)))) if len(joints) > 1 else odds
     return holes.where(odds >= 0.0), odds[odds >= 0.0]
 
 
@@ -249,13 +152,13 @@ def _measure_pockets(deficit: np.ndarray, sections: Sections, holes: Holes) -> S
     if len(holes.row) < _MIN_POCKETS:
         return np.empty(0, POCKET)
     grid = sections.grid
-    row, column = refine_positions(deficit, sections, holes)
+    row, column = evidence.refine_positions(deficit, sections, holes)
     station, angle = grid.start + (row + 0.5) * grid.step, -np.pi + (column + 0.5) * 2 * np.pi / grid.columns
-    slope = slopes(sections, holes)
-    length, width = common_size(deficit, sections, holes, slope)
-    depth = common_depth(sections, holes, slope)
+    slope = evidence.slopes(sections, holes)
+    length, width = evidence.common_size(deficit, sections, holes, slope)
+    depth = evidence.common_depth(sections, holes, slope)
     radius = float(np.median(sections.radius))
-    rim = open_rims(deficit, grid, row, column, (length, width), radius)
+    rim = evidence.open_rims(deficit, grid, row, column, (length, width), radius)
     end = 0.5 * length + _RIB
     inside = (station > grid.start + end) & (station < grid.start + grid.rows * grid.step - end)
     if np.median(rim) > _USUAL_RIM or (inside & (rim < _OPEN_RIM)).sum() < _MIN_POCKETS:
@@ -266,30 +169,6 @@ def _measure_pockets(deficit: np.ndarray, sections: Sections, holes: Holes) -> S
     pockets["length"], pockets["width"], pockets["depth"] = length, width, depth
     pockets["confidence"], pockets["measured"] = np.clip(holes.score[inside] / CLEAR, 0, 1), True
     return pockets[_drop_overlaps(pockets, odds[inside], radius)]
-
-
-def _joints_by_steps(
-    sections: Sections, holes: Holes, pockets: Shaped[np.ndarray, " p"], pitch: float
-) -> Float[np.ndarray, " r"]:
-    """Return the ring joints that steps of the wall tell, m; none where they would run through pockets."""
-    cells = np.zeros(sections.radius.shape, bool)
-    cells[holes.row, holes.column] = True
-    columns = sections.grid.columns
-    cells = binary_dilation(np.concatenate([cells] * 3, axis=1), np.ones(_RIMS))[:, columns : 2 * columns]
-    joints = find_joints_by_steps(sections, cells, pitch)
-    if not len(joints):
-        return joints
-    apart = np.abs(np.mod(pockets["station"] - joints[0] + 0.5 * pitch, pitch) - 0.5 * pitch)
-    return joints if np.mean(apart < 0.5 * pockets["length"]) < _THROUGH else np.empty(0)
-
-
-def _correct_joints(joints: Float[np.ndarray, " r"], by_steps: Float[np.ndarray, " r"]) -> Float[np.ndarray, " r"]:
-    """Return the joints by steps where those between pockets are elsewhere in the ring, m."""
-    if not len(by_steps):
-        return joints
-    pitch = float(np.diff(joints).mean())
-    apart = np.mod(joints[0] - by_steps[0] + 0.5 * pitch, pitch) - 0.5 * pitch
-    return joints if abs(apart) < _SAME_JOINT else by_steps
 
 
 def _drop_overlaps(

@@ -4,16 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy import ndimage
 from scipy.interpolate import Akima1DInterpolator
-from scipy.ndimage import (
-    binary_closing,
-    binary_dilation,
-    distance_transform_edt,
-    gaussian_filter,
-    gaussian_filter1d,
-    label,
-    median_filter,
-)
 from scipy.special import erf
 
 from scene.geometry import angle_bins, bin_angles
@@ -89,7 +81,7 @@ def fill_nearest(field: Float[np.ndarray, "rows cols"]) -> Float[np.ndarray, "ro
         return field
     columns = field.shape[1]
     wrapped = np.concatenate([field, field, field], axis=1)
-    nearest = distance_transform_edt(np.isnan(wrapped), return_distances=False, return_indices=True)
+    nearest = ndimage.distance_transform_edt(np.isnan(wrapped), return_distances=False, return_indices=True)
     return wrapped[tuple(nearest)][:, columns : 2 * columns]
 
 
@@ -103,8 +95,8 @@ def fill_holes(field: Float[np.ndarray, "rows cols"], reach: float) -> Float[np.
     was seen nowhere stays NaN, and so do small holes.
     """
     unknown = np.isnan(field)
-    depth = distance_transform_edt(unknown)
-    patch, count = label(unknown)
+    depth = ndimage.distance_transform_edt(unknown)
+    patch, count = ndimage.label(unknown)
     large = np.zeros(count + 1, bool)
     large[np.unique(patch[unknown & (depth > reach)])] = True
     hole = large[patch] & unknown
@@ -112,7 +104,7 @@ def fill_holes(field: Float[np.ndarray, "rows cols"], reach: float) -> Float[np.
     for column in np.flatnonzero(hole.any(axis=0) & ~unknown.all(axis=0)):
         seen = ~unknown[:, column]
         at = hole[:, column]
-        even = median_filter(field[seen, column], _EVEN, mode="nearest")  # one cell at the rim may be off
+        even = ndimage.median_filter(field[seen, column], _EVEN, mode="nearest")  # one cell at the rim may be off
         result[at, column] = np.interp(rows[at], rows[seen], even)
     return result
 
@@ -121,7 +113,7 @@ def median_smooth(field: Float[np.ndarray, "rows cols"], window: tuple[int, int]
     """Return the median over a window of cells; the angle wraps, the ends hold."""
     pad = window[1] // 2
     wrapped = np.concatenate([field[:, field.shape[1] - pad :], field, field[:, :pad]], axis=1)
-    return median_filter(wrapped, window, mode="nearest")[:, pad : pad + field.shape[1]]
+    return ndimage.median_filter(wrapped, window, mode="nearest")[:, pad : pad + field.shape[1]]
 
 
 def smooth_cells(
@@ -132,8 +124,8 @@ def smooth_cells(
     Weights are not negative; cells of weight 0 are not read. `sigma` is in cells along the station and around.
     """
     modes = ("nearest", "wrap")
-    total = gaussian_filter(weight, sigma, mode=modes)
-    summed = gaussian_filter(np.where(weight > 0, value, 0.0) * weight, sigma, mode=modes)
+    total = ndimage.gaussian_filter(weight, sigma, mode=modes)
+    summed = ndimage.gaussian_filter(np.where(weight > 0, value, 0.0) * weight, sigma, mode=modes)
     return np.divide(summed, total, out=np.zeros_like(summed), where=total > 1e-12), total
 
 
@@ -161,16 +153,10 @@ def resample(wall: np.ndarray, coarse: Grid, fine: Grid) -> np.ndarray:
 _PROFILE_ROW, _BESIDE = 0.25, 1.0  # m of station that make one profile; m beyond the ends: the outermost may be aslant
 _LEAST_OF_PROFILE, _MIN_COUNT = 0.1, 2  # share of the directions; points a cell
 _BRIDGED = 4  # columns without a return that a profile is drawn straight across
-_CABLE, _CABLE_OFF, _SOFT = (
-    5,
-    0.03,
-    0.7,
-)  # columns twice as broad as a cable, m that it stands off, columns of smoothing
-_STANDS_OUT, _OF_SPREAD, _MOST_OUT = (
-    0.10,
-    4.0,
-    0.25,
-)  # m, times the usual, share of a profile: more is a wall that steps
+# Columns twice as broad as a cable, m that it stands off, columns of smoothing
+_CABLE, _CABLE_OFF, _SOFT = 5, 0.03, 0.7
+# m, times the usual, share of a profile: more is a wall that steps
+_STANDS_OUT, _OF_SPREAD, _MOST_OUT = 0.10, 4.0, 0.25
 
 
 def interpolate_profiles(
@@ -191,11 +177,11 @@ def interpolate_profiles(
     value, at = value[rows], fill_around(np.where(np.isfinite(value), mean, np.nan)[rows])
     bridge = np.ones((1, _BRIDGED + 1), bool)
     seen = np.isfinite(value)
-    seen |= binary_closing(np.tile(seen, 3), bridge)[:, fine.columns : 2 * fine.columns]
+    seen |= ndimage.binary_closing(np.tile(seen, 3), bridge)[:, fine.columns : 2 * fine.columns]
     value = fill_around(value)
     usual = median_smooth(value, (1, _CABLE))
     value = np.where(np.abs(value - usual) > _CABLE_OFF, usual, value)
-    value = gaussian_filter1d(value, _SOFT, axis=1, mode="wrap")
+    value = ndimage.gaussian_filter1d(value, _SOFT, axis=1, mode="wrap")
     seen &= ~_stands_out(at, value)
     wall = np.full((fine.rows, fine.columns), np.nan)
     for column in np.flatnonzero(seen.any(axis=0)):
@@ -235,10 +221,10 @@ def estimate_sigma(
     It is the root mean square change of this wall over the distance along the bore to the nearest cell that was seen;
     where a whole direction was not seen, over 8 m, the greatest distance tried. It is at least 2 cm for each metre.
     """
-    near = binary_dilation(seen, np.ones((2 * _AROUND[0] + 1, 2 * _AROUND[1] + 1), bool))
+    near = ndimage.binary_dilation(seen, np.ones((2 * _AROUND[0] + 1, 2 * _AROUND[1] + 1), bool))
     sampling = (grid.step, 2 * np.pi * float(np.median(wall)) / grid.columns)
     wrapped = np.concatenate([near, near, near], axis=1)
-    distance = distance_transform_edt(~wrapped, sampling=sampling)[:, grid.columns : 2 * grid.columns]
+    distance = ndimage.distance_transform_edt(~wrapped, sampling=sampling)[:, grid.columns : 2 * grid.columns]
     lags = [lag for lag in _LAGS if round(lag / grid.step) < grid.rows] or [grid.step]
     change = [_wall_change(wall, near, max(round(lag / grid.step), 1)) for lag in lags]
     held = np.interp(distance, [0.0, *lags], [0.0, *np.maximum.accumulate(change)])

@@ -8,11 +8,10 @@ import tyro
 from jaxtyping import Float, Shaped
 
 from scene.bore import Bore
-from scene.cleaning.removed import OUTSIDE, Cause, Removed
+from scene.cleaning.sort import Removed
 from scene.cloud import Cloud
-from scene.errors import FitError
-from scene.judging.codes import Code, name_span
-from scene.judging.places import Coverage, Place, find_places, find_unseen, measure_overruns
+from scene.errors import OUTSIDE, Cause, Code, FitError
+from scene.judging.places import Coverage, Place, find_places, find_unseen, measure_overruns, name_span
 from scene.judging.returns import BEHIND, BEYOND, EXPLAINED, INSIDE, Returns, TrackZone, compare_returns
 
 _FLAG = tyro.conf.arg(prefix_name=False)
@@ -25,13 +24,6 @@ STATION = np.dtype([
     ("explained", "f8"), ("inside", "f8"), ("behind", "f8"), ("returns", "f8"), ("cut", "f8"), ("filled", "f8"),
     ("confidence", "f8"),
 ])  # fmt: skip
-
-
-class DoubtError(FitError):
-    """A bore was built, but it explains too little of what the scanner saw, or cannot be a tunnel.
-
-    `code` is that of the warning which refuses it.
-    """
 
 
 @dataclass(frozen=True)
@@ -258,11 +250,11 @@ def _tabulate(bore: Bore, returns: Returns, coverage: Coverage, cause: np.ndarra
 
 
 def require_trust(judgement: Judgement, force: bool) -> None:
-    """Raises `DoubtError` where a warning refuses the bore and `force` is not set.
+    """Raises `FitError` where a warning refuses the bore and `force` is not set.
 
     Poses that blur the walls are named first: what is wrong with the bore follows from them.
     """
     grave = [warning for warning in judgement.warnings if warning.refuses]
     if grave and not force:
         poses = [f"{warning.text}; so " for warning in judgement.warnings if warning.code == Code.POSES]
-        raise DoubtError(f"{''.join(poses)}{grave[0].text}; --force builds it all the same", grave[0].code)
+        raise FitError(f"{''.join(poses)}{grave[0].text}; --force builds it all the same", grave[0].code)

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from scene.bore import Bore
-from scene.judging.codes import name_span
 from scene.judging.judge import Judgement
+from scene.judging.places import name_span
 from scene.judging.returns import BEHIND, BEYOND, EXPLAINED, INSIDE, Returns
 
 COLOURS = {EXPLAINED: "#9aa5b1", INSIDE: "#d64545", BEHIND: "#2f6fde", BEYOND: "#c9a227"}

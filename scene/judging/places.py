@@ -11,8 +11,30 @@ from scipy.sparse.csgraph import connected_components
 
 from scene.bore import Bore
 from scene.geometry import angle_bins, bin_angles
-from scene.judging.codes import name_sides
 from scene.judging.returns import BEHIND, EXPLAINED, INSIDE, Returns
+
+_SIDES = ("floor", "left wall", "crown", "right wall")
+_PART = 0.15  # of the weight: a side that holds less goes unnamed
+
+
+def name_sides(angle: Float[np.ndarray, " k"], weight: Float[np.ndarray, " k"]) -> str:
+    """Name the sides of a section in which most of some weights lie, by their directions from left towards up, rad.
+
+    Returns `floor`, `left wall`, `right wall`, `crown`, two of them, or `all around`.
+    """
+    quarter = np.floor((angle + 3 * np.pi / 4) / (np.pi / 2)).astype(np.intp) % 4
+    share = np.bincount(quarter, weight, 4) / max(float(weight.sum()), 1e-12)
+    named = [_SIDES[k] for k in np.argsort(-share, kind="stable") if share[k] >= _PART]
+    if len(named) == 4:
+        return "all around"
+    return " and ".join(sorted(named)) if len(named) < 3 else ", ".join(sorted(named))
+
+
+def name_span(start: float, end: float) -> str:
+    """Return `12 m` or `from 12 to 30 m` for an interval of stations, m."""
+    first, last = f"{start:.0f}", f"{end:.0f}"
+    return f"at {first} m" if first == last else f"from {first} to {last} m"
+
 
 _CELL = 0.4  # m, edge of the boxes that join returns to a place
 _MIN_IN_CELL = 3  # points: a box with fewer holds strays

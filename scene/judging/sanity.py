@@ -15,9 +15,10 @@ from scipy.spatial import ConvexHull, cKDTree
 
 from scene.bore import Bore
 from scene.cloud import Cloud
+from scene.errors import Code
 from scene.fitting.trackseen import SeenTrack
-from scene.judging.codes import Code, name_sides, name_span
 from scene.judging.judge import Warned
+from scene.judging.places import name_sides, name_span
 from scene.writing.track import Track
 
 _BOTTOM = np.deg2rad(28)  # to each side of straight down: floor

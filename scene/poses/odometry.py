@@ -12,7 +12,7 @@ import small_gicp
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from scene.errors import FitError
+from scene.errors import FitError, Refusal
 from scene.poses.registration import deskew
 from scene.poses.trajectory import Trajectory
 from scene.progress import Stage
@@ -173,5 +173,6 @@ def estimate_odometry(recording: Recording, guide: Guide | None, stage: Stage) -
         weakest.append(tracker.register(scan, middle, guide))
         times.append(middle)
     if len(times) < 2:
-        raise FitError(f"{recording.path}: only {len(times)} scans hold {MIN_POINTS} points; too few for odometry")
+        why = f"{recording.path}: only {len(times)} scans hold {MIN_POINTS} points; too few for odometry"
+        raise FitError(why, Refusal.POSES)
     return Odometry(tracker.trajectory(times, LIBRARY), np.asarray(weakest))

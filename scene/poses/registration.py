@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from scene.cloud import Cloud, VoxelMean
-from scene.errors import FitError, RecordingError
+from scene.errors import FitError, RecordingError, Refusal
 from scene.poses.trajectory import Trajectory
 from scene.progress import Stage
 from scene.reading.recording import Recording
@@ -78,7 +78,7 @@ def register_scans(
         )
     cloud = thinned.cloud()
     if not len(cloud.points):
-        raise FitError(f"{recording.path}: no return is left after registration")
+        raise FitError(f"{recording.path}: no return is left after registration", Refusal.POSES)
     chosen = np.concatenate(low) - cloud.origin
     return Registered(cloud, uncovered, chosen[np.isfinite(chosen).all(axis=1)])
 

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from scipy.interpolate import make_smoothing_spline
 from scipy.ndimage import gaussian_filter1d
 
-from scene.errors import FitError
+from scene.errors import FitError, Refusal
 from scene.poses import terms
 from scene.poses.calibration import Mount
 from scene.poses.imu import Inertial, integrals
@@ -231,7 +231,7 @@ def make_sightings(
     """Return the control rows that lie between knots; raises `FitError` where none does."""
     inside = (control.times >= times[0]) & (control.times <= times[-1])
     if not inside.any():
-        raise FitError(f"{control.path}: no row of the control lies within the recording")
+        raise FitError(f"{control.path}: no row of the control lies within the recording", Refusal.POSES)
     when = control.times[inside]
     knot = np.clip(np.searchsorted(times, when, "right") - 1, 0, len(times) - 2)
     share = (when - times[knot]) / (times[knot + 1] - times[knot])

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from scipy.linalg import LinAlgError, solveh_banded
 from scipy.spatial.transform import Rotation
 
-from scene.errors import FitError
+from scene.errors import FitError, Refusal
 from scene.poses.imu import GRAVITY
 
 Vectors = Float[np.ndarray, "n 3"]
@@ -103,7 +103,8 @@ class NormalEquations:
         try:
             return solveh_banded(band, self._right, lower=True, overwrite_ab=True).reshape(-1, self.size)
         except LinAlgError as error:
-            raise FitError(f"the trajectory is not determined by what was measured ({error})") from error
+            why = f"the trajectory is not determined by what was measured ({error})"
+            raise FitError(why, Refusal.POSES) from error
 
 
 KNOT_SIZE = 15

@@ -13,11 +13,10 @@ import numpy as np
 import trimesh
 
 from scene.bore import Bore
-from scene.cleaning.removed import Removed
+from scene.cleaning.sort import Removed
 from scene.cloud import Cloud, thin_cloud
 from scene.config import BuildConfig
-from scene.errors import FitError
-from scene.fitting.lining import MEASURED, count_alone
+from scene.errors import FitError, Refusal
 from scene.fitting.trackseen import SeenTrack
 from scene.inputs import library_versions
 from scene.judging.judge import STATION, Judgement
@@ -79,7 +78,7 @@ def write_folder(
         try:
             mujoco.MjModel.from_xml_path(str(folder / scene))
         except ValueError as error:
-            raise FitError(f"{scene}: MuJoCo refuses the scene ({error})") from error
+            raise FitError(f"{scene}: MuJoCo refuses the scene ({error})", Refusal.MUJOCO) from error
 
 
 def state_crs(folder: Path, crs: str) -> None:
@@ -127,13 +126,6 @@ def write_geometry(
     placed = {f"furniture_{kind}": number for kind, number in count_pieces(furnished.pieces).items()}
     count |= {**placed, "furniture_niche": len(furnished.niches), "lining_faces": len(lining.faces)}
     return count, {"furniture": "by standard, in the variant furnished alone"}
-
-
-def _pockets_without_nail(result: Reconstruction) -> dict[str, int]:
-    """Return the number of pockets that no nail joins to another, by why; empty where no nails were laid."""
-    if not len(result.bore.nail):
-        return {}
-    return count_alone(result.bore, result.bore.ring_station if result.provenance["pockets"] == MEASURED else None)
 
 
 def write_manifest(path: Path, content: dict[str, Any], config: Any) -> None:
@@ -199,7 +191,6 @@ def _describe_scene(
             "rings": len(bore.ring_station),
             "pockets": len(bore.pocket),
         },
-        "pockets_without_nail": _pockets_without_nail(result),
         "track": describe_track(track, result.seen),
         "provenance": {
             "bore": provenance,

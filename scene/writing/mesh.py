@@ -30,7 +30,7 @@ def build_solid(bore: Bore, pockets: bool) -> Manifold:
     )
     solid = Manifold(Mesh64(*_close_sheet(bore, plane, sheet, np.flatnonzero(apart))))
     if solid.is_empty():
-        raise FitError(f"the sections do not make a solid ({solid.status().name})")
+        raise FitError(f"the sections do not make a solid ({solid.status().name})", Refusal.FOLDED)
     crowded = np.flatnonzero(~apart) if pockets else np.empty(0, np.intp)
     if len(crowded):
         recesses = [Manifold.hull_points(box) for box in unrolled.recess_boxes(bore, crowded)]

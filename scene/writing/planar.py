@@ -10,7 +10,7 @@ from manifold3d import Manifold, Mesh64
 from scipy.spatial.transform import Rotation
 
 from scene.bore import Bore
-from scene.errors import FitError
+from scene.errors import FitError, Refusal
 from scene.writing.mesh import has_rings
 from scene.writing.track import TrackConfig
 from scene.writing.unrolled import unroll_section
@@ -112,18 +112,19 @@ def cut_walls(solid: Manifold, bore: Bore, elevation: Float[np.ndarray, " n"], h
     level = Manifold(Mesh64(vertices, np.array(mesh.tri_verts)))
     polygons = level.slice(height).simplify(_COLLINEAR).to_polygons()
     if not polygons:
-        raise FitError(f"no wall {height:g} m above the track: the bore is not that high there")
+        raise FitError(f"no wall {height:g} m above the track: the bore is not that high there", Refusal.LEVEL)
     outline = max(polygons, key=_area)
     plan = axis.in_plan()
     along, across, _ = plan.local(np.column_stack([outline, np.zeros(len(outline))]))
     left, right = across > 0, across <= 0
     if left.sum() < 2 or right.sum() < 2:
-        raise FitError(f"no wall on both sides {height:g} m above the track")
+        raise FitError(f"no wall on both sides {height:g} m above the track", Refusal.LEVEL)
     # The outline runs counter-clockwise: forward along the right wall, back along the left one.
     first = int(np.flatnonzero(right & ~np.roll(right, 1))[0])
     order = np.roll(np.arange(len(outline)), -first)
     if np.any(np.diff(right[order].astype(int)) > 0):
-        raise FitError(f"{height:g} m above the track the outline crosses the centreline; is there a branch?")
+        why = f"{height:g} m above the track the outline crosses the centreline; is there a branch?"
+        raise FitError(why, Refusal.LEVEL)
     right_order, left_order = order[right[order]], order[left[order]][::-1]
     return Walls(
         outline[left_order],

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import gaussian_filter1d
 
 from scene.bore import Bore
-from scene.errors import FitError
+from scene.errors import FitError, Refusal
 from scene.fitting.rails import SeenRails
 from scene.fitting.trackseen import SeenLine, SeenTrack
 from scene.geometry import wall_at
@@ -175,7 +175,8 @@ def _lay_line(bore: Bore, config: TrackConfig, bed: np.ndarray, seen: SeenLine) 
         worst = int(np.argmin(clearance))
         raise FitError(
             f"the sleeper at {station[worst]:.1f} m comes within {clearance[worst]:.2f} m of the wall; "
-            f"{config.margin:g} m are needed; `--track none` lays no track"
+            f"{config.margin:g} m are needed; `--track none` lays no track",
+            Refusal.TRACK,
         )
     known = rails is not None and rails.measured
     gauge = rails.gauge if rails is not None and known else config.gauge

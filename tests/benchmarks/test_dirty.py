@@ -13,7 +13,7 @@ import trimesh
 from benchmarks import dirty
 from benchmarks.command import BenchmarkError, Ran
 from benchmarks.dirty import RIGHT, SILENT, VAGUE, WARNED, Fault, Truth, judge_build, judge_scene, list_faults
-from scene.judging.codes import Code
+from scene.errors import Code
 
 ROW: dict[str, Any] = {"status": 0, "message": "", "from": 2.0, "to": 18.0, "reversed": False}
 LENGTH, HALF, WALL = 20.0, 2.5, 2.5  # a straight arch 5 m wide and 5 m high

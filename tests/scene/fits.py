@@ -3,8 +3,8 @@
 import numpy as np
 
 from scene.bore import Bore
-from scene.cleaning.clean import CleaningConfig, clean_cloud
-from scene.cleaning.removed import Cleaned
+from scene.cleaning.clean import clean_cloud
+from scene.cleaning.sort import Cleaned
 from scene.cloud import Cloud, VoxelMean
 from scene.fitting.assemble import bore_from_sections
 from scene.fitting.centreline import CentrelineConfig
@@ -18,8 +18,8 @@ def thin(points: np.ndarray, voxel: float = 0.04) -> Cloud:
     return voxels.cloud()
 
 
-def cleaned(cloud: Cloud, strict: bool = False) -> Cleaned:
-    return clean_cloud(cloud, CleaningConfig(strict), CentrelineConfig())
+def cleaned(cloud: Cloud) -> Cleaned:
+    return clean_cloud(cloud, CentrelineConfig())
 
 
 def axis_of(cloud: Cloud) -> Axis:

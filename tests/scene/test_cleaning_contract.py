@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from scene.cleaning.removed import Cause, list_removed
+from scene.cleaning.sort import list_removed
 from scene.cleaning.tube import bridge_hanging
 from scene.cloud import Cloud
+from scene.errors import Cause
 from scene.fitting.centreline import section_middles
 from scene.fitting.section import visible_span
 from scene.geometry import axis_through

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from scene.errors import RecordingError
-from scene.judging.codes import Code
+from scene.errors import Code, RecordingError
 from scene.judging.sanity import doubt_bore
 from scene.poses import clocks
 from scene.poses.clocks import NOTICED, Clock, LidarTurns, find_lag, settle, turns_of_gyro, turns_of_poses

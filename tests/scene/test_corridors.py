@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from scene.bore import Bore
-from scene.cleaning.clean import CleaningConfig, clean_cloud
-from scene.cleaning.removed import Cause, Cleaned
+from scene.cleaning.clean import clean_cloud
+from scene.cleaning.sort import Cleaned
+from scene.errors import Cause
 from scene.fitting.assemble import fit_unfolded
 from scene.fitting.centreline import CentrelineConfig
 from scene.judging.judge import JudgingConfig, judge_bore
@@ -18,7 +19,7 @@ QUICK = ("racks", "shelves", "machines", "closets")
 def built(things: list[Thing], recesses: tuple[Thing, ...] = ()) -> tuple[Bore, Cleaned, np.ndarray, bool]:
     """The bore, its cleaning, its surface by station, lateral and height, m, and whether the judge refuses it."""
     cloud = thin(corridor(things, recesses))
-    cleaned = clean_cloud(cloud, CleaningConfig(), CentrelineConfig())
+    cleaned = clean_cloud(cloud, CentrelineConfig())
     _, bore = fit_unfolded(cleaned.cloud, cleaned.axis, 12.0, cleaned.behind)
     judgement = judge_bore(bore, cloud, JudgingConfig(), cause=cleaned.cause)
     surface = in_corridor(bore.surface() + cloud.origin)

@@ -11,10 +11,10 @@ import trimesh
 
 from scene.bore import STATION_STEP, Bore
 from scene.build import build
-from scene.cleaning.crop import ExtentConfig
-from scene.config import BuildConfig, ReconstructConfig
+from scene.config import BuildConfig
+from scene.errors import Code, FitError
 from scene.geometry import axis_through
-from scene.judging.judge import DoubtError, JudgingConfig, judge_bore
+from scene.judging.judge import JudgingConfig, judge_bore
 from scene.judging.page import render_page
 from scene.judging.sanity import doubt_bore, doubt_layers
 from tests.scene.clouds import curved_d_bore
@@ -169,6 +169,7 @@ def test_a_build_prints_and_writes_its_judgement(with_vehicle, tmp_path, capsys)
     build(with_vehicle, out)
     shown = capsys.readouterr()
     assert re.search(r"judged: \d+\.\d% of .* returns within 10 cm", shown.out)
+    assert re.search(r"stations: 0 m at \(\d.*\); they grow arbitrarily: a registered cloud", shown.out)
     assert "track: none: the survey shows no rails; --track standard lays one" in shown.out
     manifest = json.loads((out / "manifest.json").read_text())
     judgement = manifest["judgement"]
@@ -185,8 +186,9 @@ def test_a_build_prints_and_writes_its_judgement(with_vehicle, tmp_path, capsys)
 
 def test_a_build_that_explains_too_little_leaves_its_report_alone_and_force_builds_it(with_vehicle, tmp_path):
     config = BuildConfig(judging=JudgingConfig(refuse_above=0.01))
-    with pytest.raises(DoubtError, match=r"vehicle\.ply: \d+% of the returns .* --force builds it all the same"):
+    with pytest.raises(FitError, match=r"vehicle\.ply: ") as raised:
         build(with_vehicle, tmp_path / "bore", config=config)
+    assert raised.value.code is Code.UNEXPLAINED
     (report,) = tmp_path.iterdir()
     assert report.name == "bore-refused.html"
     page = report.read_text()
@@ -197,15 +199,6 @@ def test_a_build_that_explains_too_little_leaves_its_report_alone_and_force_buil
     build(with_vehicle, tmp_path / "bore", config=forced)
     assert (tmp_path / "bore" / "build.html").exists()
     assert not report.exists()
-
-
-def test_a_build_says_where_its_stations_begin_and_which_way_they_grow(with_vehicle, tmp_path, capsys):
-    extent = ExtentConfig(first=2.0, last=9.0, start_chainage=1200.0)
-    build(with_vehicle, tmp_path / "bore", config=BuildConfig(reconstruct=ReconstructConfig(extent=extent)))
-    shown = capsys.readouterr().out
-    assert re.search(r"stations: 0 m, chainage 1202 m at \(\d.*\); they grow arbitrarily: a registered cloud", shown)
-    detected = json.loads((tmp_path / "bore" / "manifest.json").read_text())["detected"]
-    assert detected["chainage_start"] == 1202.0
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,7 @@ import pytest
 
 from scene.bore import POCKET, Bore
 from scene.fitting import pockets
-from scene.fitting.evidence import odds_by_place, pocket_over_wall
-from scene.fitting.mould import Holes
+from scene.fitting.evidence import Holes, odds_by_place, pocket_over_wall
 from scene.fitting.section import Sections
 from scene.fitting.unroll import Grid
 from tests.scene.fits import fitted, thin

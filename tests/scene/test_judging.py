@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from scene.bore import Bore
-from scene.cleaning.removed import Cause
 from scene.cloud import Cloud
-from scene.judging.judge import DoubtError, Judgement, JudgingConfig, Warned, judge_bore, require_trust
+from scene.errors import Cause, Code, FitError
+from scene.judging.judge import Judgement, JudgingConfig, Warned, judge_bore, require_trust
 from scene.judging.page import draw_strips
 from scene.judging.returns import BEHIND, BEYOND, EXPLAINED, INSIDE, TrackZone, compare_returns, wall_radius
 
@@ -169,8 +169,9 @@ def test_profiles_apart_are_no_unseen_wall(bore):
 def test_a_bore_that_explains_too_little_is_refused_unless_forced(bore, wall):
     raised = about(bore, *on_wall(bore, 60_000, outward=-0.5, seed=3))
     judgement = judge_bore(bore, cloud_of(wall, raised), JudgingConfig())
-    with pytest.raises(DoubtError, match=r"50% of the returns .* --force builds it all the same"):
+    with pytest.raises(FitError) as raised:
         require_trust(judgement, force=False)
+    assert raised.value.code is Code.UNEXPLAINED
     require_trust(judgement, force=True)
     require_trust(judge_bore(bore, cloud_of(wall, raised), JudgingConfig(refuse_above=0.6)), force=False)
 
@@ -179,7 +180,7 @@ def test_poses_that_blur_the_walls_are_named_before_what_came_of_them(bore, wall
     raised = about(bore, *on_wall(bore, 60_000, outward=-0.5, seed=3))
     judgement = judge_bore(bore, cloud_of(wall, raised), JudgingConfig())
     blurred = replace(judgement, warnings=(*judgement.warnings, Warned("poses", "the poses blur the walls")))
-    with pytest.raises(DoubtError, match=r"^the poses blur the walls; so 50% of the returns"):
+    with pytest.raises(FitError, match=r"^the poses blur the walls; so 50% of the returns"):
         require_trust(blurred, force=False)
 
 

@@ -10,8 +10,7 @@ from laspy.vlrs.known import WktCoordinateSystemVlr
 from mujoco import MjModel
 
 from scene.build import blame_poses
-from scene.errors import RecordingError
-from scene.judging.codes import Code
+from scene.errors import Code, RecordingError
 from scene.judging.judge import Warned
 from scene.reading.cloudfile import read_cloud
 from scene.reading.formats import ReadingConfig, detect
