@@ -18,8 +18,6 @@ _PATCH = [(name, "f8") for name in ("station", "angle", "length", "width", "dept
 POCKET = np.dtype([*_PATCH, ("measured", "?")])
 _BOLT = [(name, "f8") for name in ("station", "angle", "length", "diameter", "depth", "confidence")]
 NAIL = np.dtype([*_BOLT, ("measured", "?")])
-_SIZES = [(name, "f8") for name in ("width", "height", "crown_radius", "wall_radius", "rms", "rms_free", "confidence")]
-STRETCH = np.dtype([("start", "f8"), ("end", "f8"), ("type", "U9"), *_SIZES])
 
 
 @dataclass(frozen=True)
@@ -42,8 +40,6 @@ class Bore:
     pocket: Shaped[np.ndarray, " p"]  # Recesses of the lining, `(p,)` of `POCKET`
     # Probability that the wall is within 5 cm of the true one, mean over the angles
     confidence: Float[np.ndarray, " n"]
-    # Stretches of one type of section, `(t,)` of `STRETCH`
-    stretch: Shaped[np.ndarray, " t"] = field(default_factory=lambda: np.empty(0, STRETCH))
     # Bolts that bridge two pockets across a joint, `(b,)` of `NAIL`
     nail: Shaped[np.ndarray, " b"] = field(default_factory=lambda: np.empty(0, NAIL))
     # Ring joints by standard, where `ring_station` has the surveyed rings, m; else empty
@@ -71,20 +67,10 @@ class Bore:
         across, along = self.radius * np.cos(self.angle), self.radius * np.sin(self.angle)
         return self.position[:, None] + across[..., None] * self.lateral[:, None] + along[..., None] * self.up[:, None]
 
-    @property
-    def section_type(self) -> Shaped[np.ndarray, " n"]:
-        """Type of section at each station: `d`, `horseshoe`, `circle` or `free`, `(n,)`."""
-        types = np.full(len(self.station), "free", STRETCH["type"])
-        for stretch in self.stretch:
-            types[(self.station >= stretch["start"]) & (self.station <= stretch["end"])] = stretch["type"]
-        return types
-
     def save(self, path: Path) -> None:
-        """Writes `bore.npz`, with what follows from the axis and the stretches; the same bore gives the same bytes."""
-        axis = self.axis
-        derived: dict[str, Any] = {"curvature": axis.curvature, "grade": axis.grade, "section_type": self.section_type}
+        """Writes `bore.npz`, with curvature and grade of the axis; the same bore gives the same bytes."""
         own: dict[str, Any] = {part.name: getattr(self, part.name) for part in fields(self)}
-        np.savez_compressed(path, schema=SCHEMA, **own, **derived)
+        np.savez_compressed(path, schema=SCHEMA, **own, curvature=self.axis.curvature, grade=self.axis.grade)
 
 
 def load_bore(path: Path) -> Bore:

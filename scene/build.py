@@ -198,7 +198,6 @@ def _fit_cloud(placed: Placed, config: ReconstructConfig, progress: Stages) -> R
         "returns": cloud.returns,
         "points": len(cloud.points),
         "flat_floor": sections.flat_floor,
-        "profile_spacing": sections.spacing or None,
         **describe_bore(bore),
     }
     removed = tuple(part.shifted(-sections.grid.start) for part in cleaned.removed)
@@ -226,9 +225,8 @@ def judge(result: Reconstruction, track: Track, config: JudgingConfig) -> Judgem
     odd += [] if result.cloud is None else doubt_layers(result.bore, result.cloud)
     judgement = Judgement(config.tolerance, ())
     if result.everything is not None:
-        spacing = float(result.facts.get("profile_spacing") or 0.0)
         zone = track_zone(track, result.bore)
-        judgement = judge_bore(result.bore, result.everything, config, zone, result.cause, result.removed, spacing)
+        judgement = judge_bore(result.bore, result.everything, config, zone, result.cause, result.removed)
     doubt = result.facts.get("clock_doubt") or result.facts.get("pose_doubt")
     seen = blame_poses(judgement.warnings) if doubt else judgement.warnings
     found = sorted([*odd, *seen], key=lambda warning: not warning.refuses)

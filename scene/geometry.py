@@ -164,9 +164,8 @@ def wall_at(side: int, across: np.ndarray, along: np.ndarray, at: np.ndarray) ->
 
 
 def find_runs(held: Bool[np.ndarray, " n"]) -> Int[np.ndarray, "k 2"]:
-    """Return first and last row of each run of rows that hold."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], held.astype(int), [0]])))
-    return edges.reshape(-1, 2) - [0, 1]
+    """Return the first row of each run of rows that hold, and the one after its last."""
+    return np.flatnonzero(np.diff(np.concatenate([[0], held.astype(int), [0]]))).reshape(-1, 2)
 
 
 def bin_angles(count: int) -> Float[np.ndarray, " m"]:

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import binary_dilation, distance_transform_edt
 from scipy.spatial import cKDTree
 
-from scene.geometry import angle_bins, bin_angles, bin_medians
+from scene.geometry import angle_bins, bin_angles, bin_medians, find_runs
 
 _TILE = 6.0  # m between places tried
 _MOST = 60  # places
@@ -256,21 +256,16 @@ def _join(one: Course, other: Course) -> Course | None:
                 continue
             fresh = int(np.argmax(ahead > STEP / 2))  # before it both were followed
             if ahead[fresh] > 0.0:
-                parts = (
-                    (first.position, second.position),
-                    (first.steady, second.steady),
-                    (first.radius, second.radius),
-                )
-                return Course(*(np.concatenate([a, b[fresh:]]) for a, b in parts))
+                names = ("position", "steady", "radius")
+                return Course(*(np.concatenate([getattr(first, n), getattr(second, n)[fresh:]]) for n in names))
     return None
 
 
 def _bridged(position: np.ndarray, steady: np.ndarray) -> np.ndarray:
     """Replaces the middles of unsteady sections: by a cubic through those around, by a line beyond the last one."""
     at = np.arange(len(position), dtype=float)
-    edges = np.flatnonzero(np.diff(np.concatenate([[1], steady.astype(int), [1]])))
     result = position.copy()
-    for first, last in zip(edges[::2], edges[1::2], strict=True):
+    for first, last in find_runs(~steady):
         before, behind = (np.flatnonzero(steady[:first])[-_AROUND:], last + np.flatnonzero(steady[last:])[:_AROUND])
         rows = np.concatenate([before, behind])
         if len(rows) < 2:

@@ -21,11 +21,11 @@ from typing import Annotated, Literal
 import numpy as np
 import tyro
 from jaxtyping import Bool, Float, Int, Shaped
+from scipy.ndimage import uniform_filter1d
 from scipy.spatial import cKDTree
 
 from scene.bore import NAIL, POCKET, Bore
 from scene.cloud import Cloud
-from scene.fitting.assemble import FREE
 from scene.fitting.pockets import FLOOR_MARGIN, could_show_pockets, find_pockets
 from scene.fitting.section import Sections
 
@@ -34,7 +34,8 @@ PLACE = 2.0 * np.pi / N_PLACES  # rad; the key is as wide
 _JOINTS = np.array([0, 3, 6, 9, 12, 15])  # places after which a radial joint follows, from the key's begin
 _STEPS = np.array([k for k in range(1, N_PLACES) if not set((_JOINTS + k) % N_PLACES) & set(_JOINTS.tolist())])
 _SEGMENT = (0.8, 2.5)  # lengths of segments, m
-_FEW = 4
+_FEW = 4  # rings whose numbers tell those between
+_ALONG, _ROUGH = 2.0, 0.03  # m of bore, and standard deviation of its wall: a rougher one is no lining of segments
 
 
 def joints_by_number(names: list[str], station: Float[np.ndarray, " r"]) -> Float[np.ndarray, " j"]:
@@ -306,9 +307,11 @@ def _add_universal_lining(
 
 
 def _is_even(bore: Bore, station: Float[np.ndarray, " k"]) -> Bool[np.ndarray, " k"]:
-    """Return where the section is of a type that segments make."""
-    row = np.clip(np.searchsorted(bore.station, station), 0, len(bore.station) - 1)
-    return np.asarray(bore.section_type[row] != FREE)
+    """Return where the section stays the same as far along as that of segments does."""
+    reach = round(_ALONG / bore.station[1])
+    wander = uniform_filter1d(bore.radius**2, reach, axis=0) - uniform_filter1d(bore.radius, reach, axis=0) ** 2
+    rough = np.sqrt(np.maximum(np.median(wander, axis=1), 0.0)) > _ROUGH
+    return ~rough[np.clip(np.searchsorted(bore.station, station), 0, len(bore.station) - 1)]
 
 
 def _standard_pockets(

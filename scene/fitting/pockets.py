@@ -192,7 +192,7 @@ def could_show_pockets(sections: Sections, depth: float) -> bool:
     near = uniform_filter(sections.support, _EXPECTED, mode=MODES)[~_near_floor(sections)]
     seen = float(np.mean(near > _MIN_EXPECTED)) if near.size else 0.0
     noise = float(np.median(sections.spread))
-    return sections.spacing == 0.0 and seen > _MIN_SEEN and noise < _NOISE_SHARE * depth
+    return seen > _MIN_SEEN and noise < _NOISE_SHARE * depth
 
 
 def _deficit(sections: Sections) -> Float[np.ndarray, "rows cols"]:

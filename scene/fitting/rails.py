@@ -1,10 +1,14 @@
 """Rails where the cloud shows them: two narrow ridges of one height, side by side all along the bore."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from scipy.ndimage import gaussian_filter1d, grey_opening, median_filter
+
+from scene.geometry import find_runs
 
 _WINDOWS = (2.0, 6.0)  # m along: so long that a bin of one holds some points
 _POINTS, _ENOUGH = 8, 4  # of a bin that are wanted, and with which rails are still told
@@ -39,6 +43,18 @@ _PIECES_AGREE = 0.004  # spread of the pieces, m: where poses blur the faces all
 _FEW_PIECES = 6  # whose spread is their standard deviation: three agree with their median by chance
 
 
+class LowPoints(NamedTuple):
+    """Points low in a bore."""
+
+    station: Float[np.ndarray, " n"]  # m
+    lateral: Float[np.ndarray, " n"]  # To the left of the axis, m
+    height: Float[np.ndarray, " n"]  # Above the floor, m
+    upward: Float[np.ndarray, " n"]  # Above the axis, in which cant is measured, m
+
+    def where(self, rows: Bool[np.ndarray, " n"]) -> "LowPoints":
+        return LowPoints(*(column[rows] for column in self))
+
+
 @dataclass(frozen=True)
 class SeenRails:
     """Both rails of one track."""
@@ -63,43 +79,29 @@ class SeenRails:
         return np.interp(station, self.station, self.offset)
 
 
-def find_rails(
-    station: Float[np.ndarray, " n"],
-    lateral: Float[np.ndarray, " n"],
-    height: Float[np.ndarray, " n"],
-    upward: Float[np.ndarray, " n"],
-) -> list[SeenRails]:
-    """Finds pairs of rails among points by station, offset to the left of the axis and height above the floor, m.
-
-    `upward` is their height above the axis, which cant is measured in. Returns one entry for each track, from the
-    right to the left; none where no pair is seen along half of the bore.
-    """
-    found = (_find_pairs(station, lateral, height, upward, narrow) for narrow in _NARROW)
+def find_rails(points: LowPoints) -> list[SeenRails]:
+    """Finds pairs of rails: one for each track, from the right to the left; none where not seen along half the bore."""
+    found = (_find_pairs(points, narrow) for narrow in _NARROW)
     return max(found, key=len)  # the first of those with as many tracks
 
 
-def can_show_rails(
-    station: Float[np.ndarray, " n"], lateral: Float[np.ndarray, " n"], height: Float[np.ndarray, " n"]
-) -> bool:
-    """Return whether points on a floor lie close enough to tell a rail from what is beside it; see `find_rails`."""
-    low = (height > _LOW[0]) & (height < _LOW[1])
-    return bool(low.sum() >= _LEAST and _returns_a_bin(station[low], lateral[low]) * _WINDOWS[1] >= _ENOUGH)
+def can_show_rails(points: LowPoints) -> bool:
+    """Return whether points on a floor lie close enough to tell a rail from what is beside it."""
+    low = points.where((points.height > _LOW[0]) & (points.height < _LOW[1]))
+    return len(low.station) >= _LEAST and _returns_a_bin(low) * _WINDOWS[1] >= _ENOUGH
 
 
-def _returns_a_bin(station: np.ndarray, lateral: np.ndarray) -> float:
+def _returns_a_bin(low: LowPoints) -> float:
     """Number of points in a bin across for each metre along."""
-    return float(len(station) / max(np.ptp(station), 1.0) * _BIN / np.ptp(lateral))
+    return float(len(low.station) / max(np.ptp(low.station), 1.0) * _BIN / np.ptp(low.lateral))
 
 
-def _find_pairs(
-    station: np.ndarray, lateral: np.ndarray, height: np.ndarray, upward: np.ndarray, narrow: int
-) -> list[SeenRails]:
+def _find_pairs(points: LowPoints, narrow: int) -> list[SeenRails]:
     """Finds pairs of ridges that are narrower than some bins; see `find_rails`."""
-    low = (height > _LOW[0]) & (height < _LOW[1])
-    station, lateral, height, upward = station[low], lateral[low], height[low], upward[low]
-    if len(station) < _LEAST:
+    low = points.where((points.height > _LOW[0]) & (points.height < _LOW[1]))
+    if len(low.station) < _LEAST:
         return []
-    a_metre = _returns_a_bin(station, lateral)
+    station, a_metre = low.station, _returns_a_bin(low)
     count = max(int(np.ptp(station) / np.clip(_POINTS / a_metre, *_WINDOWS)), 1)
     edges = np.linspace(station.min(), station.max() + 1e-6, count + 1)
     order = np.argsort(station, kind="stable")
@@ -107,7 +109,7 @@ def _find_pairs(
     pairs = []
     for k in range(count):
         rows = order[bounds[k] : bounds[k + 1]]
-        pairs += [(k, *pair) for pair in _pairs_of(*_ridges(lateral[rows], height[rows], narrow))]
+        pairs += [(k, *pair) for pair in _pairs_of(*_ridges(low.lateral[rows], low.height[rows], narrow))]
     if not pairs:
         return []
     window, middle, apart, top = np.array(pairs).T
@@ -124,7 +126,7 @@ def _find_pairs(
         if len(index) >= _MIN_SEEN * count:
             at = (edges[index] + edges[index + 1]) / 2
             offset = median_filter(middle[alike][rows], 3, mode="nearest")
-            tracks.append(_measure(station, lateral, height, upward, at, offset, float(usual), _FACE))
+            tracks.append(_measure(low, at, offset, float(usual), _FACE))
     tracks.sort(key=lambda track: -len(track.station))
     alone = [
         track for k, track in enumerate(tracks)
@@ -133,20 +135,14 @@ def _find_pairs(
     return sorted(alone, key=lambda track: float(np.median(track.offset)))
 
 
-def measure_again(
-    rails: SeenRails,
-    station: Float[np.ndarray, " n"],
-    lateral: Float[np.ndarray, " n"],
-    height: Float[np.ndarray, " n"],
-    upward: Float[np.ndarray, " n"],
-) -> SeenRails:
+def measure_again(rails: SeenRails, returns: LowPoints) -> SeenRails:
     """Return rails with the gauge that single returns near them show, as they were where these show none sharply.
 
-    The returns are given as `find_rails` takes points; those from nearer than some metres had better be left out.
+    Returns from nearer than some metres had better be left out.
     """
-    if len(station) < _FACE_RETURNS:
+    if len(returns.station) < _FACE_RETURNS:
         return rails
-    found = _measure(station, lateral, height, upward, rails.station, rails.offset, rails.apart, _CLEAR_FACE)
+    found = _measure(returns, rails.station, rails.offset, rails.apart, _CLEAR_FACE)
     return replace(rails, gauge=found.gauge, spread=found.spread, pieces=found.pieces) if found.measured else rails
 
 
@@ -167,10 +163,8 @@ def _ridges(lateral: np.ndarray, height: np.ndarray, narrow: int) -> tuple[np.nd
     top = np.where(np.isnan(top), np.minimum(left, right), top)  # behind a rail nothing is seen
     padded = np.pad(top, narrow, mode="edge")
     high = (padded - grey_opening(padded, narrow))[narrow:-narrow] > _RIDGE
-    ends = np.flatnonzero(np.diff(np.concatenate([[0], high.astype(int), [0]])))
-    middles = [first + (a + b) / 2 * _BIN for a, b in zip(ends[::2], ends[1::2], strict=True)]
-    tops = [float(np.median(top[a:b])) for a, b in zip(ends[::2], ends[1::2], strict=True)]
-    return np.array(middles), np.array(tops)
+    ridges = find_runs(high)
+    return first + ridges.sum(axis=1) / 2 * _BIN, np.array([np.median(top[a:b]) for a, b in ridges])
 
 
 def _pairs_of(middle: np.ndarray, top: np.ndarray) -> list[tuple[float, float, float]]:
@@ -204,19 +198,13 @@ def _follow(window: np.ndarray, middle: np.ndarray) -> list[np.ndarray]:
 
 
 def _measure(
-    station: np.ndarray,
-    lateral: np.ndarray,
-    height: np.ndarray,
-    upward: np.ndarray,
-    at: np.ndarray,
-    offset: np.ndarray,
-    apart: float,
-    face: tuple[float, float],
+    points: LowPoints, at: np.ndarray, offset: np.ndarray, apart: float, face: tuple[float, float]
 ) -> SeenRails:
     """Measures gauge, cant and height of one track, whose middle lies at `offset` where `at` says, m.
 
     `face` is the layer below the heads' tops that their inner faces are looked for in, m.
     """
+    station, lateral, height, upward = points
     for _ in range(2):
         across = lateral - np.interp(station, at, offset)
         block = np.clip(np.searchsorted((at[1:] + at[:-1]) / 2, station), 0, len(at) - 1)
@@ -273,10 +261,8 @@ def _robust_spread(values: np.ndarray) -> float:
 def _block_tops(height: np.ndarray, block: np.ndarray, rows: np.ndarray, count: int) -> np.ndarray:
     """Most frequent height near the top of each block's points, m."""
     result = np.full(count, np.nan)
-    order = np.flatnonzero(rows)[np.argsort(block[rows], kind="stable")]
-    bounds = np.searchsorted(block[order], np.arange(count + 1))
-    for k in range(count):
-        one = height[order[bounds[k] : bounds[k + 1]]]
+    for k, own in _blocks(block, rows, count):
+        one = height[own]
         if len(one) >= 5:
             upper = one[one > np.percentile(one, 90) - 0.04]
             result[k] = np.median(upper[upper > np.percentile(upper, 30)])
@@ -287,12 +273,16 @@ def _block_tops(height: np.ndarray, block: np.ndarray, rows: np.ndarray, count: 
 def _block_medians(value: np.ndarray, block: np.ndarray, rows: np.ndarray, count: int) -> np.ndarray:
     """Median of each block's values, less the middle of both sides where it is an offset; NaN where few are there."""
     result = np.full(count, np.nan)
-    order = np.flatnonzero(rows)[np.argsort(block[rows], kind="stable")]
-    bounds = np.searchsorted(block[order], np.arange(count + 1))
-    for k in range(count):
-        if bounds[k + 1] - bounds[k] >= 5:
-            result[k] = np.median(value[order[bounds[k] : bounds[k + 1]]])
+    for k, own in _blocks(block, rows, count):
+        if len(own) >= 5:
+            result[k] = np.median(value[own])
     return result
+
+
+def _blocks(block: np.ndarray, rows: np.ndarray, count: int) -> Iterator[tuple[int, Int[np.ndarray, " k"]]]:
+    """Yields the number of each block, and those of its points that are among `rows`."""
+    order = np.flatnonzero(rows)[np.argsort(block[rows], kind="stable")]
+    return enumerate(np.split(order, np.searchsorted(block[order], np.arange(1, count))))
 
 
 def _inner_edge(across: np.ndarray, above: np.ndarray, face: tuple[float, float]) -> float:

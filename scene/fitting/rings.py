@@ -8,7 +8,7 @@ from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 
-from scene.bore import POCKET, STATION_STEP, STRETCH, Bore
+from scene.bore import POCKET, STATION_STEP, Bore
 from scene.errors import FitError
 from scene.fitting.assemble import describe_bore
 from scene.fitting.lining import LiningConfig, add_standard_lining, joints_by_number
@@ -69,7 +69,6 @@ def bore_from_rings(fit: RingFit, origin: Float[np.ndarray, "3"]) -> Bore:
     centre = fit.centre - origin
     axis = axis_through(centre, STATION_STEP)
     at = np.clip(axis.local(centre)[0], 0.0, axis.length)
-    mean, rms = float(fit.radius.mean()), float(np.sqrt(np.mean(fit.rms**2)))
     angle = section_angles()
     radius = np.interp(axis.station, at, fit.radius)
     distance = np.abs(axis.station[:, None] - at[None]).min(axis=1)
@@ -90,7 +89,6 @@ def bore_from_rings(fit: RingFit, origin: Float[np.ndarray, "3"]) -> Bore:
         pocket=np.empty(0, POCKET),
         confidence=np.interp(axis.station, at, fit.seen)
         * probability_known(np.hypot(np.interp(axis.station, at, fit.rms), UNSEEN_GROWTH * distance)),
-        stretch=np.array([(0.0, axis.length, "circle", *[2 * mean] * 2, mean, mean, rms, np.nan, 1.0)], STRETCH),
     )
 
 

@@ -1,9 +1,8 @@
 """From cloud and axis to the section at every station, at the half-metre scale.
 
 A coarse grid of medians gives a first wall that pockets, rails and people cannot move. The mean residual of small
-cells against it, cleaned of such things and smoothed over a few decimetres, gives the wall itself. Where the survey
-is profiles some way apart, the wall follows a curve through them. A flat floor is fitted as a line under the
-track, and the walls are extended into its corners.
+cells against it, cleaned of such things and smoothed over a few decimetres, gives the wall itself. A flat floor is
+fitted as a line under the track, and the walls are extended into its corners.
 """
 
 from dataclasses import dataclass
@@ -17,13 +16,11 @@ from scene.errors import FitError, Refusal
 from scene.fitting import unroll
 from scene.fitting.floor import Floors, clip_to_floor, extend_to_floor, find_floors, is_floor
 from scene.fitting.unroll import Grid, fill_sides
-from scene.geometry import N_ANGLES, Axis, angle_bins
+from scene.geometry import N_ANGLES, Around, Axis, angle_bins, find_runs
 
-DENSE_STEP = 0.25  # m; where nearly every row of this length was seen, the survey is no row of profiles
+DENSE_STEP = 0.25  # m; where fewer than most rows of this length were seen, the survey is a row of profiles
 OVERRUN = 3.0  # m beyond the axis that are looked at
-_STEPS = (DENSE_STEP, 0.5, 1.0, 1.5, 2.0)  # m
-_MIN_ROWS_SEEN = 0.9
-_MOST_GAPS = 0.4  # of the rows: with more unseen the survey is profiles too far apart
+_GAP = 2.0  # m unseen along the bore: longer is a gap of the survey, and no distance of its profiles
 _END_COVERAGE = 0.4
 _DENSE = 0.7
 _TRIM_STEP = 0.05
@@ -34,25 +31,24 @@ def visible_span(station: np.ndarray, angle: np.ndarray, axis: Axis) -> tuple[fl
     grid = Grid.over(-OVERRUN, axis.length + OVERRUN, DENSE_STEP, 24)
     cell = grid.cell(station, angle)
     count = np.bincount(cell[cell >= 0], minlength=grid.rows * grid.columns).reshape(grid.rows, grid.columns)
-    rows = np.flatnonzero((count > 0).mean(axis=1) > _END_COVERAGE)
-    if len(rows) and len(rows) >= _DENSE * (rows[-1] - rows[0] + 1):
-        first, last = grid.start + rows[0] * grid.step, grid.start + (rows[-1] + 1) * grid.step
-        rows = (station >= first) & (station <= last)
-        inside, turn = station[rows], angle[rows]
-        start, end = _trim_end(inside, first, 1), -_trim_end(-inside, -last, 1)
-        return _trim_aslant(inside, turn, start), -_trim_aslant(-inside, turn, -end)
-    # Profiles apart, and aslant to the axis where the bore flares: the first and the last one are the ends.
-    rows = np.flatnonzero((uniform_filter1d((count > 0).astype(float), 3, axis=0) > 0).mean(axis=1) > _END_COVERAGE)
+    shown = (count > 0).mean(axis=1) > _END_COVERAGE
+    rows = np.flatnonzero(shown)
     if not len(rows):
         raise FitError("no tunnel in the cloud: hardly a section shows most of its circumference", Refusal.UNSEEN)
-    first, last = (grid.start + (row + 0.5) * grid.step for row in (rows[0], rows[-1]))
-    return _profile_station(station, first, 1), _profile_station(station, last, -1)
+    if _share_seen(shown[rows[0] : rows[-1] + 1]) < _DENSE:
+        why = f"profiles more than {DENSE_STEP:g} m apart leave the wall between them unknown"
+        raise FitError(why, Refusal.UNSEEN)
+    first, last = grid.start + rows[0] * grid.step, grid.start + (rows[-1] + 1) * grid.step
+    inside = (station >= first) & (station <= last)
+    station, angle = station[inside], angle[inside]
+    start, end = _trim_end(station, first, 1), -_trim_end(-station, -last, 1)
+    return _trim_aslant(station, angle, start), -_trim_aslant(-station, angle, -end)
 
 
-def _profile_station(station: np.ndarray, outermost: float, inwards: int) -> float:
-    """Station of the profile whose outermost points lie near a station, m."""
-    ahead = inwards * (station - outermost)
-    return float(np.median(station[(ahead > -2 * DENSE_STEP) & (ahead < 3 * DENSE_STEP)]))
+def _share_seen(shown: Bool[np.ndarray, " rows"]) -> float:
+    """Share of rows shown; long runs of unseen rows, the gaps of a survey, do not count."""
+    runs = np.diff(find_runs(~shown), axis=1)
+    return float(shown.sum() / (len(shown) - runs[runs > _GAP / DENSE_STEP].sum()))
 
 
 def _trim_end(station: np.ndarray, end: float, behind: float) -> float:
@@ -86,27 +82,6 @@ def _trim_aslant(station: np.ndarray, angle: np.ndarray, end: float) -> float:
         return end
     most = float(np.median(seen))
     return most if most > end + _ASLANT else end
-
-
-def profile_spacing(station: np.ndarray, start: float, end: float) -> float:
-    """Return the shortest row of which nearly all were seen, m; `DENSE_STEP` for a dense survey.
-
-    Raises `FitError` for profiles further apart than 2 m.
-    """
-    inside = station[(station >= start) & (station <= end)]
-    for step in _STEPS:
-        edges = np.arange(start, end, step)
-        if _share_seen(np.histogram(inside, np.append(edges, end))[0] > 0, step) >= _MIN_ROWS_SEEN:
-            return step
-    raise FitError(f"profiles more than {_STEPS[-1]:g} m apart leave the wall between them unknown", Refusal.UNSEEN)
-
-
-def _share_seen(seen: np.ndarray, step: float) -> float:
-    """Share of rows seen; long runs of unseen rows, the gaps of a survey, do not count."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], (~seen).astype(int), [0]])))
-    runs = (edges[1::2] - edges[::2]) * step
-    gaps = float(runs[runs > _STEPS[-1]].sum()) / step
-    return float(seen.sum() / (len(seen) - (gaps if gaps < _MOST_GAPS * len(seen) else 0.0)))
 
 
 _COARSE_ANGLES = 120
@@ -143,7 +118,6 @@ class Sections:
     sigma: Float[np.ndarray, "rows cols"]  # Standard deviation of the wall's radius, m
     flat_floor: bool  # True where the section stands on a flat floor
     voxel: float  # Thinning of the cloud it was fitted to, m
-    spacing: float  # Distance of the survey's profiles, about, m; 0 for a dense cloud
 
 
 @dataclass(frozen=True)
@@ -156,8 +130,8 @@ class _Points:
     weight: np.ndarray
 
     @classmethod
-    def about(cls, station: np.ndarray, lateral: np.ndarray, upward: np.ndarray, weight: np.ndarray) -> "_Points":
-        return cls(station, np.arctan2(upward, lateral), np.hypot(lateral, upward), weight)
+    def about(cls, around: Around, weight: np.ndarray) -> "_Points":
+        return cls(around.station, around.angle, around.radius, weight)
 
     def medians(self, grid: Grid) -> Float[np.ndarray, "rows cols"]:
         return unroll.cell_medians(grid, grid.cell(self.station, self.angle), self.radius)
@@ -176,26 +150,18 @@ def fit_sections(cloud: Cloud, axis: Axis, behind: Float[np.ndarray, "k 3"] | No
     was seen, or its middle is not open.
     """
     whole = axis.at(np.arange(-OVERRUN, axis.length + OVERRUN, DENSE_STEP))
-    station, lateral, upward = whole.local(cloud.points.astype(np.float64))
-    points = _Points.about(station, lateral, upward, cloud.weights)
-    stand_in = None if behind is None or not len(behind) else _Points.about(*whole.local(behind), np.ones(len(behind)))
-    start, end = visible_span(station, points.angle, axis)
-    step = profile_spacing(station, start, end)
-    floors = find_floors(station, lateral, upward, start, end, axis)
+    around = whole.local(cloud.points.astype(np.float64))
+    points = _Points.about(around, cloud.weights)
+    stand_in = None if behind is None or not len(behind) else _Points.about(whole.local(behind), np.ones(len(behind)))
+    start, end = visible_span(points.station, points.angle, axis)
+    floors = find_floors(*around, start, end, axis)
     fine = Grid.over(start, end, *_FINE)
-    steps = [step, *(longer for longer in _THIN_STEPS if longer > step)]
-    grids = [Grid.over(start, end, length, _COARSE_ANGLES) for length in steps]
+    grids = [Grid.over(start, end, length, _COARSE_ANGLES) for length in (DENSE_STEP, *_THIN_STEPS)]
     coarse = next((grid for grid in grids if _share_of_cells(points, grid) >= _MIN_COVERAGE), grids[0])
     wall = _first_wall(points, coarse, fine, floors, stand_in)
     _require_open_middle(points, fine, wall)
-    if step > DENSE_STEP:
-        wall, seen = unroll.interpolate_profiles(points.station, points.angle, points.radius, fine)
-        if floors is not None:
-            wall = clip_to_floor(extend_to_floor(wall, fine, floors, wall), fine, floors)
-    else:
-        wall, seen = _follow_wall(points, wall, fine, floors)
-    sigma, spacing = unroll.estimate_sigma(wall, seen, fine), step if step > DENSE_STEP else 0.0
-    return _measure_wall(points, wall, sigma, fine, floors is not None, cloud.voxel, spacing)
+    wall, seen = _follow_wall(points, wall, fine, floors)
+    return _measure_wall(points, wall, unroll.estimate_sigma(wall, seen, fine), fine, floors is not None, cloud.voxel)
 
 
 def _share_of_cells(points: _Points, grid: Grid) -> float:
@@ -275,7 +241,7 @@ def _cut_corners(first: np.ndarray, residual: np.ndarray, weight: np.ndarray, fi
 
 
 def _measure_wall(
-    points: _Points, wall: np.ndarray, sigma: np.ndarray, fine: Grid, flat_floor: bool, voxel: float, spacing: float
+    points: _Points, wall: np.ndarray, sigma: np.ndarray, fine: Grid, flat_floor: bool, voxel: float
 ) -> Sections:
     """Measures what the points show of the wall that was fitted to them."""
     cell, outward = points.outward_of(wall, fine)
@@ -289,6 +255,5 @@ def _measure_wall(
     spread = np.sqrt(squares / np.maximum(support.sum(axis=1), 1e-9))
     inlier = (weight > 0) & (np.abs(residual) < _NEAR_WALL)
     return Sections(
-        fine, wall, residual, weight, support, deepest.reshape(wall.shape), spread, inlier, sigma, flat_floor, voxel,
-        spacing,
+        fine, wall, residual, weight, support, deepest.reshape(wall.shape), spread, inlier, sigma, flat_floor, voxel
     )  # fmt: skip

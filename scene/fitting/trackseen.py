@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float
 from scene.bore import Bore
 from scene.cloud import Cloud
 from scene.fitting.evidence import steadier_than_chance
-from scene.fitting.rails import SeenRails, can_show_rails, find_rails, measure_again
-from scene.geometry import angle_bins
+from scene.fitting.rails import LowPoints, SeenRails, can_show_rails, find_rails, measure_again
+from scene.geometry import angle_bins, find_runs
 
 _BIN = 0.01  # m along
 _SMOOTH = 0.09  # m, box; well below a sleeper's width
@@ -71,9 +71,10 @@ def find_track(cloud: Cloud, bore: Bore, flat_floor: bool = True) -> SeenTrack:
 
     On a round invert nothing is looked for but rails.
     """
-    station, lateral, upward, height = above_floor(cloud.points.astype(np.float64), bore)
+    points = above_floor(cloud.points.astype(np.float64), bore)
+    station, lateral, height, _ = points
     lines = []
-    for rails in find_rails(station, lateral, height, upward):
+    for rails in find_rails(points):
         # Sleepers need no better than 5 cm, and so depend on little else.
         across = lateral - np.round(rails.offset_at(station) / _ASIDE) * _ASIDE
         inside = np.abs(across) < min(_BETWEEN_RAILS, rails.apart / 2 - _FOOT)
@@ -84,11 +85,11 @@ def find_track(cloud: Cloud, bore: Bore, flat_floor: bool = True) -> SeenTrack:
         inside = np.abs(lateral) < _BETWEEN_RAILS
         sleepers = _find_sleepers(station[inside], height[inside], bore.length, None)
         lines = [SeenLine(sleepers, None)] if sleepers is not None else []
-    return SeenTrack(tuple(lines), sought=True, thin=not can_show_rails(station, lateral, height))
+    return SeenTrack(tuple(lines), sought=True, thin=not can_show_rails(points))
 
 
-def above_floor(points: Float[np.ndarray, "n 3"], bore: Bore) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return station, lateral offset, and height above the axis and the floor of the points low in the bore, m."""
+def above_floor(points: Float[np.ndarray, "n 3"], bore: Bore) -> LowPoints:
+    """Return the points low in the bore."""
     station, lateral, upward = bore.axis.local(points)
     widest = float(np.median(bore.width)) / 2 - _WALL
     low = (upward < 0) & (np.abs(lateral) < widest) & (station > 0) & (station < bore.length)
@@ -98,7 +99,7 @@ def above_floor(points: Float[np.ndarray, "n 3"], bore: Bore) -> tuple[np.ndarra
     column = angle_bins(angle, len(bore.angle))
     lean = angle - bore.angle[column]
     floor = bore.radius[row, column] * np.sin(bore.angle[column]) / np.sin(bore.angle[column] + lean)
-    return station, lateral, upward, (floor - radius) * -np.sin(angle)
+    return LowPoints(station, lateral, (floor - radius) * -np.sin(angle), upward)
 
 
 def _top_level(height: np.ndarray, rail_top: float | None) -> float:
@@ -129,8 +130,7 @@ def _find_sleepers(
     total = np.convolve(np.bincount(index, minlength=bins), box, mode="same")
     raised = np.convolve(np.bincount(index[height[near] > step], minlength=bins), box, mode="same")
     share = np.divide(raised, total, out=np.zeros(bins), where=total > 2)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], (share > 0.5).astype(int), [0]])))
-    first, last = edges[::2], edges[1::2]
+    first, last = find_runs(share > 0.5).T
     wide = ((last - first) * _BIN > _WIDTHS[0]) & ((last - first) * _BIN < _WIDTHS[1])
     if wide.sum() < 3:
         return None
@@ -208,19 +208,15 @@ def measure_gauge(seen: SeenTrack, low: Float[np.ndarray, "n 3"], bore: Bore) ->
     if not seen.shows_rails or not len(low):
         return seen
     parts = [_beside_rails(low[k : k + _CHUNK], bore, seen.lines) for k in range(0, len(low), _CHUNK)]
-    near = np.concatenate(parts)
-    lines = (SeenLine(one.sleepers, measure_again(one.rails, *near.T), one.bed) if one.rails else one
-             for one in seen.lines)  # fmt: skip
+    near = LowPoints(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+    lines = (replace(one, rails=measure_again(one.rails, near)) if one.rails else one for one in seen.lines)
     return replace(seen, lines=tuple(lines))
 
 
-def _beside_rails(
-    points: Float[np.ndarray, "n 3"], bore: Bore, lines: tuple[SeenLine, ...]
-) -> Float[np.ndarray, "k 4"]:
-    """Return station, offset, height above the floor and above the axis of the points near any rail, m."""
-    station, lateral, upward, height = above_floor(points, bore)
-    near = np.zeros(len(station), bool)
+def _beside_rails(points: Float[np.ndarray, "n 3"], bore: Bore, lines: tuple[SeenLine, ...]) -> LowPoints:
+    """Return the points near any rail."""
+    low = above_floor(points, bore)
+    near = np.zeros(len(low.station), bool)
     for rails in (line.rails for line in lines if line.rails is not None):
-        near |= np.abs(np.abs(lateral - rails.offset_at(station)) - rails.apart / 2) < _BESIDE
-    near &= np.abs(height) < _TALLEST
-    return np.column_stack([station, lateral, height, upward])[near]
+        near |= np.abs(np.abs(low.lateral - rails.offset_at(low.station)) - rails.apart / 2) < _BESIDE
+    return low.where(near & (np.abs(low.height) < _TALLEST))

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
-from scipy.interpolate import Akima1DInterpolator
 from scipy.special import erf
 
 from scene.geometry import angle_bins, bin_angles
@@ -129,15 +128,6 @@ def smooth_cells(
     return np.divide(summed, total, out=np.zeros_like(summed), where=total > 1e-12), total
 
 
-def fill_around(field: Float[np.ndarray, "rows cols"]) -> Float[np.ndarray, "rows cols"]:
-    """Fills NaN cells by linear interpolation around each row; the angle wraps. A row of NaN stays."""
-    result, columns = field.copy(), np.arange(field.shape[1], dtype=float)
-    for row in np.flatnonzero(np.isnan(field).any(axis=1) & np.isfinite(field).any(axis=1)):
-        seen = np.isfinite(field[row])
-        result[row] = np.interp(columns, columns[seen], field[row][seen], period=field.shape[1])
-    return result
-
-
 def resample(wall: np.ndarray, coarse: Grid, fine: Grid) -> np.ndarray:
     """Interpolates the coarse wall linearly on the fine grid; the angle wraps, the ends hold."""
     row = np.clip((fine.station - coarse.start) / coarse.step - 0.5, 0, coarse.rows - 1)
@@ -148,62 +138,6 @@ def resample(wall: np.ndarray, coarse: Grid, fine: Grid) -> np.ndarray:
     left = np.floor(column).astype(np.intp)
     part = column - left
     return (1 - part) * along[:, left % coarse.columns] + part * along[:, (left + 1) % coarse.columns]
-
-
-_PROFILE_ROW, _BESIDE = 0.25, 1.0  # m of station that make one profile; m beyond the ends: the outermost may be aslant
-_LEAST_OF_PROFILE, _MIN_COUNT = 0.1, 2  # share of the directions; points a cell
-_BRIDGED = 4  # columns without a return that a profile is drawn straight across
-# Columns twice as broad as a cable, m that it stands off, columns of smoothing
-_CABLE, _CABLE_OFF, _SOFT = 5, 0.03, 0.7
-# m, times the usual, share of a profile: more is a wall that steps
-_STANDS_OUT, _OF_SPREAD, _MOST_OUT = 0.10, 4.0, 0.25
-
-
-def interpolate_profiles(
-    station: Float[np.ndarray, " p"], angle: Float[np.ndarray, " p"], radius: Float[np.ndarray, " p"], fine: Grid
-) -> tuple[Float[np.ndarray, "rows cols"], Bool[np.ndarray, "rows cols"]]:
-    """Return the wall between profiles some way apart, along a curve through them in every direction, m.
-
-    What stands before the wall in one profile alone is left out. The second result tells the cells with a return.
-
-    Source: Akima 1970, J. ACM 17(4), in the modified form that does not overshoot beside flat pieces.
-    """
-    grid = Grid.over(fine.start - _BESIDE, fine.start + fine.rows * fine.step + _BESIDE, _PROFILE_ROW, fine.columns)
-    cell = grid.cell(station, angle)
-    value = cell_medians(grid, cell, radius)
-    mean, count = cell_means(grid, cell, station, np.ones(len(station)))
-    value[count < _MIN_COUNT] = np.nan
-    rows = np.isfinite(value).mean(axis=1) > _LEAST_OF_PROFILE
-    value, at = value[rows], fill_around(np.where(np.isfinite(value), mean, np.nan)[rows])
-    bridge = np.ones((1, _BRIDGED + 1), bool)
-    seen = np.isfinite(value)
-    seen |= ndimage.binary_closing(np.tile(seen, 3), bridge)[:, fine.columns : 2 * fine.columns]
-    value = fill_around(value)
-    usual = median_smooth(value, (1, _CABLE))
-    value = np.where(np.abs(value - usual) > _CABLE_OFF, usual, value)
-    value = ndimage.gaussian_filter1d(value, _SOFT, axis=1, mode="wrap")
-    seen &= ~_stands_out(at, value)
-    wall = np.full((fine.rows, fine.columns), np.nan)
-    for column in np.flatnonzero(seen.any(axis=0)):
-        shown = seen[:, column]
-        known = at[shown, column]
-        if len(known) < 3:
-            wall[:, column] = np.interp(fine.station, known, value[shown, column])
-            continue
-        curve = Akima1DInterpolator(known, value[shown, column], method="makima")
-        wall[:, column] = curve(np.clip(fine.station, known[0], known[-1]))
-    own = fine.cell(station, angle)
-    return fill_nearest(wall), np.bincount(own[own >= 0], minlength=wall.size).reshape(wall.shape) > 0
-
-
-def _stands_out(at: np.ndarray, value: np.ndarray) -> Bool[np.ndarray, "n cols"]:
-    """Return what the profiles before and behind contradict, and are contradicted less by their own neighbours."""
-    miss = np.zeros_like(value)
-    share = (at[1:-1] - at[:-2]) / (at[2:] - at[:-2])
-    miss[1:-1] = np.abs(value[1:-1] - (1 - share) * value[:-2] - share * value[2:])
-    out = miss > max(_STANDS_OUT, _OF_SPREAD * 1.4826 * float(np.median(miss)))
-    out &= out.mean(axis=1, keepdims=True) < _MOST_OUT
-    return out & (miss >= np.maximum(np.roll(miss, 1, axis=0), np.roll(miss, -1, axis=0)))
 
 
 TOLERANCE = 0.05  # m; "known" is known within this

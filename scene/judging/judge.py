@@ -107,15 +107,14 @@ def judge_bore(
     track: TrackZone | None = None,
     cause: np.ndarray | None = None,
     removed: tuple[Removed, ...] = (),
-    spacing: float = 0.0,
 ) -> Judgement:
     """Judges a bore against every return of the registered cloud before cleaning, `everything`, in the bore's frame.
 
     `cause` holds the `Cause` of each of its points, `(n,)`, `None` where nothing was cut; `track` is the space of the
-    track, `None` where none was laid; `spacing` the distance of the survey's profiles, m, 0 for a dense survey.
+    track, `None` where none was laid.
     """
     returns = compare_returns(bore, everything, config.tolerance, track)
-    coverage = find_unseen(bore, returns, spacing)
+    coverage = find_unseen(bore, returns)
     places, strays = find_places(bore, returns)
     inside = float(returns.weight[returns.in_span].sum())
     stations = _tabulate(bore, returns, coverage, cause)

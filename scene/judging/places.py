@@ -203,13 +203,9 @@ class Coverage:
         return float(self.seen.mean())
 
 
-def find_unseen(bore: Bore, returns: Returns, spacing: float = 0.0) -> Coverage:
-    """Finds the parts of a bore's wall on which hardly a return lies.
-
-    `spacing` is the distance of the survey's profiles, m; 0 for a dense survey.
-    """
-    step = max(ROW, 2.5 * spacing)
-    rows = max(round(bore.length / step), 1)
+def find_unseen(bore: Bore, returns: Returns) -> Coverage:
+    """Finds the parts of a bore's wall on which hardly a return lies."""
+    rows = max(round(bore.length / ROW), 1)
     edges = np.linspace(0.0, bore.length, rows + 1)
     on_wall = (returns.kind == EXPLAINED) & (returns.station >= 0) & (returns.station <= bore.length)
     row = np.minimum((returns.station[on_wall] / bore.length * rows).astype(np.intp), rows - 1)

@@ -17,6 +17,7 @@ from scene.bore import Bore
 from scene.cloud import Cloud
 from scene.errors import Code
 from scene.fitting.trackseen import SeenTrack
+from scene.geometry import find_runs
 from scene.judging.judge import Warned
 from scene.judging.places import name_sides, name_span
 from scene.writing.track import Track
@@ -26,9 +27,8 @@ _FLAT_FLOOR = 0.02  # m rms about a line: with more it is no flat floor
 _LEAST_LEAN = np.deg2rad(1.2)
 _ALIKE = np.deg2rad(0.6)  # about the usual lean
 _MOST_OF_IT = 0.8  # share of the stations that lean alike
-_WALLS = np.deg2rad(
-    np.arange(70.0, 130.0)
-)  # from straight up, to both sides: walls; what hangs under a crown is on one side
+# From straight up, to both sides: walls; what hangs under a crown is on one side
+_WALLS = np.deg2rad(np.arange(70.0, 130.0))
 _EVENER, _UNEVEN = 0.5, 0.01  # share of the difference between both sides that is left; m of it when taken as upright
 
 
@@ -251,9 +251,8 @@ def _doubt_dents(bore: Bore) -> list[Warned]:
         corners = ConvexHull(np.column_stack([y[row], z[row]])).vertices
         corners = corners[np.argsort(bore.angle[corners])]
         depth[row] = _hull_radius(bore.angle, bore.angle[corners], bore.radius[row, corners]) - bore.radius[row]
-    dented = np.concatenate([[0], (depth.max(axis=1) > _DENT).astype(int), [0]])
     result = []
-    for first, last in zip(np.flatnonzero(np.diff(dented) > 0), np.flatnonzero(np.diff(dented) < 0) - 1, strict=True):
+    for first, last in find_runs(depth.max(axis=1) > _DENT) - np.array([0, 1]):
         start, end = float(bore.station[first]), float(bore.station[last])
         if end - start < _DENT_LENGTH:
             continue

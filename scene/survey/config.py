@@ -60,8 +60,7 @@ class SurveyConfig:
     scan_every: int = 1  # Keep every so many scans of the VLP-16 and the OS1.
     speed: float = 1.0  # Mean walking speed, m/s.
     point_rate: int = 240_000  # Points per second of the Avia; fewer thin the survey.
-    # Also write the first sensor's returns as `cloud.ply` and `cloud.pcd`.
-    cloud: bool = False
+    cloud: bool = False  # Also write the first sensor's returns as `cloud.ply`.
     # Errors of the instruments. Zero, or the flag's `no-` form, switches a part off.
     errors: SensorErrors = field(default_factory=SensorErrors)
     # Conventions of drivers that the recordings are written in.

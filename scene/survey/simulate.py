@@ -175,8 +175,7 @@ def _simulate_device(
     with ExitStack() as stack:
         cloud = None
         if config.cloud and name == config.sensors[0]:
-            paths = (stack.enter_context(replace_file(config.out / f"cloud.{kind}")) for kind in ("ply", "pcd"))
-            cloud = stack.enter_context(CloudWriter(*paths))
+            cloud = stack.enter_context(CloudWriter(stack.enter_context(replace_file(config.out / "cloud.ply"))))
         progress = stack.enter_context(Progress(console=console, transient=True))
         tracked = progress.track(seen, total=count, description=f"survey, {name}")
         bag = config.out / f"survey{one.suffix}.bag"

@@ -64,19 +64,21 @@ def write_mesh(path: Path, mesh: Mesh) -> None:
 
 
 class CloudWriter:
-    """Writes returns in the survey frame, float64, to a binary PLY, and a binary PCD if asked, as they come."""
+    """Writes returns in the survey frame, float64, to a binary PLY as they come."""
 
-    def __init__(self, ply: Path, pcd: Path | None = None) -> None:
-        self._files = [(ply.open("wb"), _ply_header)]
-        if pcd is not None:
-            self._files.append((pcd.open("wb"), _pcd_header))
-        self._count = 0
-        self._write_headers()
+    def __init__(self, ply: Path) -> None:
+        self._file, self._count = ply.open("wb"), 0
+        self._write_header()
 
-    def _write_headers(self) -> None:
-        for file, header in self._files:
-            file.seek(0)
-            file.write(header(self._count))
+    def _write_header(self) -> None:
+        # Blanks after the count would break strict readers, so a comment takes up the slack.
+        pad = "x" * (12 - len(str(self._count)))
+        header = (
+            f"ply\nformat binary_little_endian 1.0\ncomment simulated {pad}\nelement vertex {self._count}\n"
+            "property double x\nproperty double y\nproperty double z\nproperty float intensity\nend_header\n"
+        )
+        self._file.seek(0)
+        self._file.write(header.encode())
 
     def add(self, placed: Float[np.ndarray, "n 3"], intensity: Shaped[np.ndarray, "n"]) -> None:
         """Appends points, m, in the survey frame."""
@@ -84,8 +86,7 @@ class CloudWriter:
         points["x"], points["y"], points["z"] = placed.T
         points["intensity"] = intensity
         self._count += len(points)
-        for file, _ in self._files:
-            file.write(points.tobytes())
+        self._file.write(points.tobytes())
 
     def __enter__(self) -> "CloudWriter":
         return self
@@ -93,27 +94,9 @@ class CloudWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Puts the final counts into the headers and closes."""
-        self._write_headers()
-        for file, _ in self._files:
-            file.close()
-
-
-def _ply_header(count: int) -> bytes:
-    # Blanks after the count would break strict readers, so a comment takes up the slack.
-    pad = "x" * (12 - len(str(count)))
-    return (
-        f"ply\nformat binary_little_endian 1.0\ncomment simulated {pad}\nelement vertex {count}\n"
-        "property double x\nproperty double y\nproperty double z\nproperty float intensity\nend_header\n"
-    ).encode()
-
-
-def _pcd_header(count: int) -> bytes:
-    pad = "x" * (24 - 2 * len(str(count)))
-    return (
-        f"# .PCD v0.7 - simulated {pad}\nVERSION 0.7\nFIELDS x y z intensity\nSIZE 8 8 8 4\nTYPE F F F F\n"
-        f"COUNT 1 1 1 1\nWIDTH {count}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {count}\nDATA binary\n"
-    ).encode()
+        """Puts the final count into the header and closes."""
+        self._write_header()
+        self._file.close()
 
 
 TRUTH_STEP = 0.25  # m between the stations of the truth

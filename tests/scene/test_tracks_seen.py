@@ -59,7 +59,7 @@ def seen_in(name: str, sensor: str = "os1") -> SeenTrack:
     return find_track(*scanned(name, sensor))
 
 
-def low_points(name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def low_points(name: str) -> rails_seen.LowPoints:
     cloud, bore = scanned(name)
     return above_floor(cloud.points.astype(np.float64), bore)
 
@@ -121,12 +121,12 @@ def test_cant_is_measured():
 
 
 def test_the_gauge_of_a_canted_track_is_that_of_its_own_plane():
-    station, lateral, upward, height = low_points("proud")
+    station, lateral, height, upward = low_points("proud")
     gauges = []
     for lean in np.radians([0.0, 7.0]):  # the very same track on its side, by as much as railways are canted
         across = lateral * np.cos(lean) - upward * np.sin(lean)
         upright = lateral * np.sin(lean) + upward * np.cos(lean)
-        (line,) = rails_seen.find_rails(station, across, height / np.cos(lean), upright)
+        (line,) = rails_seen.find_rails(rails_seen.LowPoints(station, across, height / np.cos(lean), upright))
         gauges.append(line.gauge)
     assert gauges[1] == pytest.approx(gauges[0], abs=0.001)  # across, not in its plane, it would be 10 mm less
 
@@ -221,35 +221,35 @@ def test_sleepers_that_nobody_saw_are_said_to_stand_by_the_spacing():
 
 
 def test_a_gauge_between_faces_that_poses_blur_is_not_measured(monkeypatch):
-    station, lateral, upward, height = low_points("proud")
+    station, lateral, height, upward = low_points("proud")
     blurred = lateral + np.random.default_rng(1).normal(0.0, 0.012, len(lateral))
-    (line,) = rails_seen.find_rails(station, blurred, height, upward)
+    (line,) = rails_seen.find_rails(rails_seen.LowPoints(station, blurred, height, upward))
     assert not line.measured
     monkeypatch.setattr(rails_seen, "_FACE_SHARP", 1.0)
     monkeypatch.setattr(rails_seen, "_HEAD_SHARP", 1.0)
-    (line,) = rails_seen.find_rails(station, blurred, height, upward)
+    (line,) = rails_seen.find_rails(rails_seen.LowPoints(station, blurred, height, upward))
     assert line.measured  # all pieces agree
     assert line.gauge < 1.435 - 0.005
 
 
 @pytest.mark.parametrize("blur", [0.03, 0.04])
 def test_rails_that_poses_broaden_are_found_and_have_no_gauge(blur, monkeypatch):
-    station, lateral, upward, height = low_points("double")
+    station, lateral, height, upward = low_points("double")
     blurred = lateral + np.random.default_rng(2).normal(0.0, blur, len(lateral))
-    tracks = rails_seen.find_rails(station, blurred, height, upward)
+    tracks = rails_seen.find_rails(rails_seen.LowPoints(station, blurred, height, upward))
     assert [float(np.median(one.offset)) for one in tracks] == pytest.approx([-2.1, 2.1], abs=0.02)
     assert not any(one.measured for one in tracks)
     monkeypatch.setattr(rails_seen, "_NARROW", (9,))
-    assert not rails_seen.find_rails(station, blurred, height, upward)
+    assert not rails_seen.find_rails(rails_seen.LowPoints(station, blurred, height, upward))
 
 
 def test_heads_too_broad_for_any_rail_show_no_gauge(monkeypatch):
-    station, lateral, upward, height = low_points("proud")
+    station, lateral, height, upward = low_points("proud")
     blurred = lateral + np.random.default_rng(4).normal(0.0, 0.027, len(lateral))
-    (line,) = rails_seen.find_rails(station, blurred, height, upward)
+    (line,) = rails_seen.find_rails(rails_seen.LowPoints(station, blurred, height, upward))
     assert not line.measured
     monkeypatch.setattr(rails_seen, "_HEAD_SHARP", 1.0)
-    (line,) = rails_seen.find_rails(station, blurred, height, upward)
+    (line,) = rails_seen.find_rails(rails_seen.LowPoints(station, blurred, height, upward))
     assert line.measured  # and 17 mm narrow, in all pieces alike
     assert line.gauge < 1.435 - 0.015
 
@@ -286,9 +286,8 @@ def test_single_returns_show_a_gauge_that_means_of_voxels_widen(simulated):
 def test_few_or_blurred_returns_leave_the_gauge_as_it_was(simulated):
     found = simulated.found
     rails = found.seen.lines[0].rails
-    station, lateral, upward, height = above_floor(found.cloud.points.astype(np.float64), found.bore)
-    again = measure_again(rails, station, lateral, height, upward)
-    assert again.gauge != rails.gauge
-    blurred = lateral + np.random.default_rng(1).normal(0.0, 0.012, len(lateral))
-    assert measure_again(rails, station, blurred, height, upward) is rails
-    assert measure_again(rails, station[:5], lateral[:5], height[:5], upward[:5]) is rails
+    low = above_floor(found.cloud.points.astype(np.float64), found.bore)
+    assert measure_again(rails, low).gauge != rails.gauge
+    blurred = low.lateral + np.random.default_rng(1).normal(0.0, 0.012, len(low.lateral))
+    assert measure_again(rails, low._replace(lateral=blurred)) is rails
+    assert measure_again(rails, low.where(np.arange(len(blurred)) < 5)) is rails
