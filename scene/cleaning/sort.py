@@ -255,17 +255,17 @@ def list_removed(
     `behind` is how far each point is behind the wall, m; what a user should know of gets a warning by it.
     """
     result = []
-    for index in np.unique(cause[cause != Cause.KEPT]):
-        rows = np.flatnonzero(cause == index)
+    for kind in (kind for kind in Cause if kind is not Cause.KEPT and (cause == kind).any()):
+        rows = np.flatnonzero(cause == kind)
         rows = rows[np.argsort(station[rows], kind="stable")]
         for part in np.split(rows, np.flatnonzero(np.diff(station[rows]) > gap) + 1):
             named, depth = part, np.zeros(2)
             if behind is not None:
                 depth = np.percentile(behind[part], [1, 99])
-                if index == Cause.BRANCH:  # one goes to its mouth to look, and not to the middle of what was cut
+                if kind is Cause.BRANCH:  # one goes to its mouth to look, and not to the middle of what was cut
                     named = part[behind[part] <= np.percentile(behind[part], _ROOT)]
             x, y, z = (float(v) for v in np.median(cloud.points[named].astype(np.float64), axis=0) + cloud.origin)
             first, last = (float(station[part[end]]) for end in (0, -1))
             depths = float(depth[0]), float(depth[1])
-            result.append(Removed(first, last, Cause(index), len(part), (x, y, z), *depths))
+            result.append(Removed(first, last, kind, len(part), (x, y, z), *depths))
     return tuple(sorted(result, key=lambda part: (part.start, part.cause)))

@@ -9,7 +9,7 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 
 from scene.bore import POCKET, STATION_STEP, Bore
-from scene.errors import FitError
+from scene.errors import FitError, Refusal
 from scene.fitting.assemble import describe_bore
 from scene.fitting.lining import LiningConfig, add_standard_lining, joints_by_number
 from scene.fitting.unroll import UNSEEN_GROWTH, probability_known
@@ -42,7 +42,7 @@ def fit_rings(survey: RingSurvey) -> RingFit:
     """
     for name, points in zip(survey.names, survey.points, strict=True):
         if len(points) < _MIN_POINTS:
-            raise FitError(f"{survey.path}: ring {name} has {len(points)} points; at least {_MIN_POINTS} are needed")
+            raise _refuse(survey, f"ring {name} has {len(points)} points; at least {_MIN_POINTS} are needed")
     centre = np.array([points.mean(axis=0) for points in survey.points])
     _require_order(survey, centre)
     for _ in range(_PASSES):
@@ -53,13 +53,12 @@ def fit_rings(survey: RingSurvey) -> RingFit:
     radius, rms, seen = (np.array([fit[k] for fit in fits]) for k in (1, 2, 3))
     if (rms > _LARGEST_RESIDUAL).any():
         worst = int(np.argmax(rms))
-        raise FitError(f"{survey.path}: ring {survey.names[worst]} is no circle (rms {rms[worst]:.2f} m)")
+        raise _refuse(survey, f"ring {survey.names[worst]} is no circle (rms {rms[worst]:.2f} m)")
     odd = (radius < _RADII[0]) | (radius > _RADII[1])
     if odd.any():
         worst = int(np.argmax(odd))
-        raise FitError(
-            f"{survey.path}: ring {survey.names[worst]} has a radius of {radius[worst]:.4g} m; is the unit right?"
-        )
+        why = f"ring {survey.names[worst]} has a radius of {radius[worst]:.4g} m; is the unit right?"
+        raise _refuse(survey, why)
     _require_no_gap(survey, centre)
     return RingFit(survey.names, centre, radius, rms, seen)
 
@@ -104,21 +103,26 @@ def _require_order(survey: RingSurvey, centre: np.ndarray) -> None:
     length = np.linalg.norm(step, axis=1)
     if (length < _LEAST_SPACING).any():
         at = int(np.argmin(length))
-        raise FitError(f"{survey.path}: rings {survey.names[at]} and {survey.names[at + 1]} lie at the same place")
+        raise _refuse(survey, f"rings {survey.names[at]} and {survey.names[at + 1]} lie at the same place")
     turn = np.einsum("ij,ij->i", step[:-1], step[1:])
     if (turn < 0).any():
         at = int(np.argmax(turn < 0)) + 1
-        raise FitError(f"{survey.path}: the rings are out of order: the tunnel turns back at ring {survey.names[at]}")
+        raise _refuse(survey, f"the rings are out of order: the tunnel turns back at ring {survey.names[at]}")
 
 
 def _require_no_gap(survey: RingSurvey, centre: np.ndarray) -> None:
     length = np.linalg.norm(np.diff(centre, axis=0), axis=1)
     if (length > _LONGEST_GAP).any():
         at = int(np.argmax(length))
-        raise FitError(
-            f"{survey.path}: between rings {survey.names[at]} and {survey.names[at + 1]} lie {length[at]:.1f} m "
-            f"without a ring; at most {_LONGEST_GAP:g} m can be bridged"
+        raise _refuse(
+            survey,
+            f"between rings {survey.names[at]} and {survey.names[at + 1]} lie {length[at]:.1f} m without a ring; "
+            f"at most {_LONGEST_GAP:g} m can be bridged",
         )
+
+
+def _refuse(survey: RingSurvey, why: str) -> FitError:
+    return FitError(f"{survey.path}: {why}", Refusal.RINGS)
 
 
 def _fit_circle(

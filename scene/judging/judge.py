@@ -5,12 +5,11 @@ from typing import Annotated, Any
 
 import numpy as np
 import tyro
-from jaxtyping import Float, Shaped
 
 from scene.bore import Bore
 from scene.cleaning.sort import Removed
 from scene.cloud import Cloud
-from scene.errors import OUTSIDE, Cause, Code, FitError
+from scene.errors import OUTSIDE, Code, FitError
 from scene.judging.places import Coverage, Place, find_places, find_unseen, measure_overruns, name_span
 from scene.judging.returns import BEHIND, BEYOND, EXPLAINED, INSIDE, Returns, TrackZone, compare_returns
 
@@ -19,11 +18,6 @@ _LISTED = 10  # places and worst stations that are listed
 _WINDOW = 2.0  # m of bore that one worst station stands for
 _WARN_LOCAL = 0.05  # of the returns at a place's stations: a place with fewer is listed without a warning
 _WARN_UNSEEN = 0.10  # of the girth
-STATION = np.dtype([
-    ("start", "f8"), ("end", "f8"), ("width", "f8"), ("height", "f8"), ("seen", "f8"), ("floor", "f8"),
-    ("explained", "f8"), ("inside", "f8"), ("behind", "f8"), ("returns", "f8"), ("cut", "f8"), ("filled", "f8"),
-    ("confidence", "f8"),
-])  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -57,7 +51,6 @@ class Judgement:
     coverage: Coverage | None = None  # Unseen wall
     places: tuple[Place, ...] = ()  # Unexplained returns, the largest place first
     scattered: float = 0.0  # Share of the returns between the ends that are unexplained and belong to no place
-    stations: Shaped[np.ndarray, " r"] | None = None  # Table by metres, of `STATION`
     worst: tuple[tuple[float, float, float], ...] = ()  # First and last station, m, and share unexplained
 
     @property
@@ -117,7 +110,6 @@ def judge_bore(
     coverage = find_unseen(bore, returns)
     places, strays = find_places(bore, returns)
     inside = float(returns.weight[returns.in_span].sum())
-    stations = _tabulate(bore, returns, coverage, cause)
     worst = _worst_windows(bore, returns)
     warnings = [
         *_warn_of_share(returns, cause, places, worst, config),
@@ -127,7 +119,7 @@ def judge_bore(
         *_warn_of_places(places, config.tolerance),
     ]
     scattered = float(returns.weight[strays].sum()) / max(inside, 1e-9)
-    return Judgement(config.tolerance, tuple(warnings), returns, coverage, places, scattered, stations, worst)
+    return Judgement(config.tolerance, tuple(warnings), returns, coverage, places, scattered, worst)
 
 
 def _warn_of_share(
@@ -226,26 +218,6 @@ def _worst_windows(bore: Bore, returns: Returns) -> tuple[tuple[float, float, fl
         if all(abs(int(k) - other) > 1 for other in result):
             result.append(int(k))
     return tuple((float(edges[k]), float(edges[k + 1]), float(share[k])) for k in result)
-
-
-def _tabulate(bore: Bore, returns: Returns, coverage: Coverage, cause: np.ndarray | None) -> Shaped[np.ndarray, " r"]:
-    edges = np.append(coverage.start, coverage.end[-1])
-    middle = (edges[1:] + edges[:-1]) / 2
-
-    def weigh(rows: np.ndarray) -> Float[np.ndarray, " r"]:
-        return np.histogram(returns.station[rows], edges, weights=returns.weight[rows])[0]
-
-    total = weigh(returns.in_span)
-    table = np.zeros(len(middle), STATION)
-    table["start"], table["end"], table["returns"] = edges[:-1], edges[1:], total
-    table["seen"], table["floor"] = coverage.seen.mean(axis=1), coverage.floor
-    for name, kind in (("explained", EXPLAINED), ("inside", INSIDE), ("behind", BEHIND)):
-        table[name] = weigh(returns.kind == kind) / np.maximum(total, 1e-9)
-    table["cut"] = 0.0 if cause is None else weigh((cause != Cause.KEPT) & returns.in_span) / np.maximum(total, 1e-9)
-    for name, values in (("width", bore.width), ("height", bore.height), ("confidence", bore.confidence)):
-        table[name] = np.interp(middle, bore.station, values)
-    table["filled"] = np.interp(middle, bore.station, bore.filled.astype(float))
-    return table
 
 
 def require_trust(judgement: Judgement, force: bool) -> None:

@@ -76,32 +76,6 @@ def draw_profile(bore: Bore) -> str:
     return _svg(_WIDTH, height, [*parts, *_station_axis(bore.length, height)])
 
 
-def draw_strips(judgement: Judgement, length: float) -> str:
-    """Return one strip for each share of the table of stations: dark where all, light where none."""
-    table = judgement.stations
-    if table is None:
-        return ""
-    rows = (
-        ("seen", "wall seen", "#2f855a"), ("floor", "floor seen", "#2f855a"), ("inside", "inside", COLOURS[INSIDE]),
-        ("behind", "behind", "#2f6fde"), ("cut", "cut away", "#c9a227"), ("filled", "filled", "#6b7280"),
-    )  # fmt: skip
-    parts, height = [], 24 * len(rows) + 30
-    scale = (_WIDTH - 2 * _MARGIN - 40) / length
-    for k, (name, title, colour) in enumerate(rows):
-        y = 5 + 24 * k
-        parts.append(f'<text x="{_MARGIN + 32}" y="{y + 13}" text-anchor="end">{title}</text>')
-        for row in table:
-            share = float(row[name])
-            strength = share if name in ("seen", "floor", "filled") else min(share / 0.3, 1.0)
-            if strength > 0.02:
-                parts.append(
-                    f'<rect x="{_MARGIN + 40 + row["start"] * scale:.1f}" y="{y}" height="18" fill="{colour}" '
-                    f'width="{(row["end"] - row["start"]) * scale + 0.3:.1f}" opacity="{strength:.2f}">'
-                    f"<title>{row['start']:.0f} to {row['end']:.0f} m: {share:.0%}</title></rect>"
-                )
-    return _svg(_WIDTH, height, [*parts, *_station_axis(length, height, 40)])
-
-
 def draw_section(bore: Bore, returns: Returns, start: float, end: float) -> str:
     """Return the section in the middle of some stations, with the returns between them over it."""
     row = int(bore.row_of((start + end) / 2))
@@ -225,9 +199,6 @@ def render_page(name: str, bore: Bore, judgement: Judgement, content: dict[str, 
         "<h2>Plan</h2>", draw_plan(bore, judgement.returns), _KEY if judgement.returns is not None else "",
         "<h2>Profile</h2>", draw_profile(bore),
     ]  # fmt: skip
-    if judgement.stations is not None:
-        parts += ["<h2>Station by station</h2>", draw_strips(judgement, bore.length),
-                  "<p>The same as numbers is in <code>stations.csv</code>.</p>"]  # fmt: skip
     parts += [*_sections(bore, judgement), *_tables(judgement, content)]
     return (
         f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{text(name)}</title>'

@@ -169,7 +169,6 @@ _SPARSE = 0.03  # of the usual number of returns of a cell: with fewer it was no
 _MIN_AREA = 3.0  # m² of wall in one piece: a smaller one is a shadow that its neighbours tell about
 _MIN_LENGTH, _MIN_GIRTH = 1.5, 0.9  # m
 _CENTRES = bin_angles(SECTORS)
-_FLOOR = np.deg2rad(35)
 
 
 @dataclass(frozen=True)
@@ -191,11 +190,6 @@ class Coverage:
     end: Float[np.ndarray, " r"]  # Last station, m
     seen: Bool[np.ndarray, "r c"]  # True where enough returns lie on the wall
     pieces: tuple[Unseen, ...]  # Unseen pieces of some size, the largest first
-
-    @property
-    def floor(self) -> Float[np.ndarray, " r"]:
-        """Share of the floor, 35° to each side of straight down, that was seen in each row."""
-        return self.seen[:, np.abs(_CENTRES + np.pi / 2) < _FLOOR].mean(axis=1)
 
     @property
     def share(self) -> float:

@@ -19,7 +19,7 @@ from scene.config import BuildConfig
 from scene.errors import FitError, Refusal
 from scene.fitting.trackseen import SeenTrack
 from scene.inputs import library_versions
-from scene.judging.judge import STATION, Judgement
+from scene.judging.judge import Judgement
 from scene.judging.page import render_page
 from scene.poses.trajectory import Trajectory, save_tum
 from scene.writing.furnished import count_pieces, furnish_bore, planar_segments
@@ -65,7 +65,6 @@ def write_folder(
     if crs := result.facts.get("crs"):
         state_crs(folder, str(crs))
     content |= {"judgement": judgement.facts, "removed": [part.facts for part in result.removed]}
-    write_stations(folder / "stations.csv", judgement)
     (folder / "build.html").write_text(render_page(name, result.bore, judgement, content), encoding="utf-8")
     write_manifest(folder / "manifest.json", content, config)
     if result.cloud is not None:
@@ -198,11 +197,3 @@ def _describe_scene(
             **{asset: kind.replace("measured", provenance) for asset, kind in assets.items()},
         },
     }
-
-
-def write_stations(path: Path, judgement: Judgement) -> None:
-    """Writes what was seen, cut and filled, metre by metre; a ring survey gives a header alone."""
-    names = STATION.names or ()
-    table = np.empty(0, STATION) if judgement.stations is None else judgement.stations
-    rows = (",".join(f"{row[name]:.4g}" for name in names) for row in table)
-    path.write_text("\n".join([",".join(names), *rows]) + "\n")

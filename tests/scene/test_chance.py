@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from scene.bore import POCKET
-from scene.fitting import pockets, trackseen
+from scene.fitting import evidence, pockets, trackseen
 from scene.fitting.evidence import more_than_chance, steadier_than_chance
 from tests.scene.clouds import curved_d_bore
 from tests.scene.fits import fitted, thin
@@ -32,10 +32,10 @@ def test_no_ring_and_no_pocket_is_measured_where_there_is_none(cloud, line, monk
     sections = fitted(thinned, line)[1]
     found, joints = pockets.find_pockets(sections)
     assert len(found) == len(joints) == 0
-    monkeypatch.setattr(pockets, "open_rims", lambda deficit, grid, row, *rest: np.zeros(len(row)))
+    monkeypatch.setattr(evidence, "open_rims", lambda deficit, grid, row, *rest: np.zeros(len(row)))
     monkeypatch.setattr(pockets, "_keep_likely", lambda deficit, sections, holes: (holes, np.zeros(len(holes.row))))
     reached = []
-    monkeypatch.setattr(pockets, "more_than_chance", lambda found, *rest: reached.append(len(found)))
+    monkeypatch.setattr(evidence, "more_than_chance", lambda found, *rest: reached.append(len(found)))
     pockets.find_pockets(sections)
     assert max(reached, default=0) >= 10, "this cloud does not try the evidence at all"
 

@@ -5,7 +5,6 @@ import pytest
 
 from scene.cleaning.sort import list_removed
 from scene.cleaning.tube import bridge_hanging
-from scene.cloud import Cloud
 from scene.errors import Cause
 from scene.fitting.centreline import section_middles
 from scene.fitting.section import visible_span
@@ -37,22 +36,13 @@ def test_what_was_removed_is_listed_by_stretch_with_its_place_in_the_frame_of_th
     np.testing.assert_allclose(removed[-1].place, there, atol=1e-3)
 
 
-def test_a_branch_that_runs_on_beside_the_bore_is_named_where_it_meets_it():
-    """Another bore 14 m behind the wall over 50 m, joined by a passage of 3 m."""
-    random = np.random.default_rng(1)
-    along = np.concatenate([random.uniform(5, 55, 4000), random.uniform(22, 25, 2000)])
-    behind = np.concatenate([random.uniform(10, 14, 4000), random.uniform(0.5, 12, 2000)])
-    cloud = Cloud(
-        np.stack([along, behind, 0 * along], axis=1).astype(np.float32), np.ones(6000), np.zeros(3), 6000, 0.04
-    )
-    (part,) = list_removed(cloud, np.full(6000, Cause.BRANCH), along, 3.0, behind)
-    assert "meets it from 22 to 25 m" in part.warning
-    assert "meets it from 122 to 125 m" in part.shifted(100.0).warning
-    assert "meets it from 35 to 38 m" in part.reversed(60.0).warning
-    passage = along > 56  # nothing of it
-    passage[4000:] = True
-    alone = list_removed(cloud, np.where(passage, Cause.BRANCH, 0), along, 3.0, behind)
-    assert "meets" not in alone[0].warning
+def test_stations_of_what_was_removed_follow_the_axis():
+    cloud = thin(curved_d_bore(length=20).points)
+    cause = np.zeros(len(cloud.points), np.int8)
+    cause[:10] = Cause.INSIDE
+    (part,) = list_removed(cloud, cause, np.full(len(cause), 4.0), gap=1.0)
+    assert (part.shifted(-1.5).start, part.shifted(-1.5).end) == (2.5, 2.5)
+    assert (part.reversed(20.0).start, part.reversed(20.0).end) == (16.0, 16.0)
 
 
 @pytest.mark.parametrize("lean", [0.0, 0.25])

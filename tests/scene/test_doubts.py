@@ -177,11 +177,7 @@ def test_a_build_prints_and_writes_its_judgement(with_vehicle, tmp_path, capsys)
     for warning in judgement["warnings"]:
         assert f"warning: {warning['text']} [{warning['code']}]" in shown.err
     assert judgement["warnings"]
-    for name in ("build.html", "stations.csv"):
-        assert manifest["files"][name] == hashlib.sha256((out / name).read_bytes()).hexdigest()
-    table = np.genfromtxt(out / "stations.csv", delimiter=",", names=True)
-    assert len(table) == round(manifest["bore"]["length"])
-    assert table["inside"][8:13].mean() > table["inside"][:6].mean() + 0.05
+    assert manifest["files"]["build.html"] == hashlib.sha256((out / "build.html").read_bytes()).hexdigest()
 
 
 def test_a_build_that_explains_too_little_leaves_its_report_alone_and_force_builds_it(with_vehicle, tmp_path):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from scene.bore import POCKET, Bore
-from scene.fitting import pockets
+from scene.fitting import evidence, pockets
 from scene.fitting.evidence import Holes, odds_by_place, pocket_over_wall
 from scene.fitting.section import Sections
 from scene.fitting.unroll import Grid
@@ -69,7 +69,7 @@ def count_hits(wall: tuple) -> tuple[int, int]:
 
 def test_thin_walls_and_filled_pockets_are_none_and_every_open_one_is(wall, monkeypatch) -> None:
     assert count_hits(wall) == (0, 0)
-    monkeypatch.setattr(pockets, "pocket_over_wall", lambda sections, holes, size: np.zeros(len(holes.row)))
+    monkeypatch.setattr(evidence, "pocket_over_wall", lambda sections, holes, size: np.zeros(len(holes.row)))
     assert count_hits(wall)[1] > 5, "this wall does not try the evidence"
 
 

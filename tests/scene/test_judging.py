@@ -9,7 +9,6 @@ from scene.bore import Bore
 from scene.cloud import Cloud
 from scene.errors import Cause, Code, FitError
 from scene.judging.judge import Judgement, JudgingConfig, Warned, judge_bore, require_trust
-from scene.judging.page import draw_strips
 from scene.judging.returns import BEHIND, BEYOND, EXPLAINED, INSIDE, TrackZone, compare_returns, wall_radius
 
 FLOOR = -3.2
@@ -139,16 +138,9 @@ def test_a_bore_unseen_all_around_is_told_in_plain_words(bore):
     assert "from 8 to 12 m hardly a return lies all around (" in judgement.warnings[0].text
 
 
-def test_an_unseen_floor_is_named_and_told_station_by_station(bore):
+def test_an_unseen_floor_is_named(bore):
     judgement = judged_without(bore, lambda station, _, upward: (upward < -3.1) & (station > 8) & (station < 18))
     assert "from 8 to 18 m hardly a return lies on the floor" in judgement.warnings[0].text
-    table = judgement.stations
-    within = (table["start"] > 8.5) & (table["end"] < 17.5)
-    assert table["floor"][within].max() == 0.0
-    assert table["floor"][(table["end"] < 7.5) | (table["start"] > 18.5)].min() == 1.0
-    strips = draw_strips(judgement, bore.length)
-    assert "floor seen" in strips
-    assert strips.count("<rect") == 2 * len(table) - int((table["floor"] == 0.0).sum())
 
 
 def test_strays_do_not_count_as_having_seen_a_wall(bore):
@@ -185,20 +177,6 @@ def test_what_was_cut_away_as_another_tunnel_refuses_nothing(bore, wall):
     judgement = judge_bore(bore, cloud, JudgingConfig(), cause=cause)
     assert not any(w.refuses for w in judgement.warnings)
     assert judgement.shares["behind"] == pytest.approx(0.5, abs=0.01)
-    assert judgement.stations["cut"][5] > 0.3
-
-
-def test_the_table_of_stations_says_what_was_seen_and_unexplained(bore, wall):
-    filled = replace(bore, filled=bore.station < 4.0)
-    judgement = judge_bore(filled, cloud_of(wall, block(bore, *THINGS["vehicle"][0])), JudgingConfig())
-    table = judgement.stations
-    assert table["start"][0] == 0.0
-    assert table["end"][-1] == pytest.approx(bore.length)
-    assert (table["filled"][:3] == 1.0).all()
-    assert (table["filled"][5:] == 0.0).all()
-    assert table["inside"][11] == pytest.approx(667 / (667 + 2500), abs=0.05)
-    assert table["inside"][3] == 0.0
-    np.testing.assert_allclose(table["explained"] + table["inside"] + table["behind"], 1.0, atol=1e-9)
 
 
 @pytest.mark.parametrize(("overhead", "length", "said"), [(False, 8.0, False), (True, 1.2, False), (True, 8.0, True)])

@@ -10,7 +10,7 @@ from manifold3d import Error, Manifold, Mesh64
 from scipy.ndimage import gaussian_filter
 
 from scene.bore import POCKET, Bore
-from scene.errors import FitError
+from scene.errors import FitError, Refusal
 from scene.writing import mjcf
 from scene.writing.mesh import as_trimesh, build_solid, open_lining, split_lining
 from scene.writing.planar import cut_walls
@@ -110,8 +110,9 @@ def test_the_lining_faces_the_axis(case):
 
 def test_sections_that_fold_into_each_other_are_an_error_with_their_place():
     bore = arc_bore(length=24.0, radius=60.0)
-    with pytest.raises(FitError, match=r"fold into each other at \d"):
+    with pytest.raises(FitError, match=r"at \d+\.\d m") as raised:
         build_solid(replace(bore, radius=bore.radius * 25), pockets=False)
+    assert raised.value.code is Refusal.FOLDED
 
 
 def test_a_ray_into_a_pocket_goes_13_cm_further(bore):
