@@ -31,9 +31,10 @@ def test_a_build_reads_twice_and_the_one_after_a_kill_reads_nothing_and_writes_t
 
     survey, out = simulated.survey, tmp_path / "scene"
     monkeypatch.setattr(RosBag, "scans", counted)
-    with monkeypatch.context() as until, pytest.raises(Killed):
+    with monkeypatch.context() as until:
         until.setattr(pipeline, "clean_cloud", kill)
-        build(survey / "survey.bag", out, survey / "groundtruth.tum", NAMED)
+        with pytest.raises(Killed):
+            build(survey / "survey.bag", out, survey / "groundtruth.tum", NAMED)
     assert passes.count("whole") == 2  # for the times of all sweeps, and to place them
     assert not out.exists()
     (kept,) = tmp_path.iterdir()
