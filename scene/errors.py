@@ -42,7 +42,7 @@ class Code(StrEnum):
     POSES = "poses"  # Poses that blur the walls
     ROUNDED = "rounded"  # Coordinates rounded to centimetres
     # Shapes that no tunnel has
-    DENT = "dent"  # A section dented inwards
+    DENT = "dent"  # A crown dented inwards
     GRADE = "grade"  # Steeper than any road or railway
     LEAN = "lean"  # Floor and walls lean together
     LYING = "lying"  # A tunnel on its side

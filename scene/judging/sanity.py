@@ -19,7 +19,7 @@ from scene.errors import Code
 from scene.fitting.trackseen import SeenTrack
 from scene.geometry import find_runs
 from scene.judging.judge import Warned
-from scene.judging.places import name_sides, name_span
+from scene.judging.places import name_span
 from scene.writing.track import Track
 
 _BOTTOM = np.deg2rad(28)  # to each side of straight down: floor
@@ -153,6 +153,7 @@ _UNITS = {"mm": 1e-3, "cm": 1e-2, "ft": 0.3048, "m": 1.0}
 _STEEP, _LYING = 0.20, 0.80  # grade: no road or railway climbs more than a fifth; at 40° it is no tunnel to drive in
 _FLAT, _ROUND = 0.02, 0.10  # m: departure of a side from a straight line that is a floor's, and a crown's
 _DENT, _DENT_LENGTH = 0.25, 3.0  # m inwards, and along the bore: deeper and longer than roughness and noise
+_OVERHEAD = 0.7  # sine of the lowest direction of a dent: walls under an open ceiling, and platforms, step in rightly
 _FACING = np.deg2rad(35)  # to each side of a direction
 
 
@@ -241,7 +242,7 @@ def _doubt_lying(bore: Bore) -> list[Warned]:
 
 
 def _doubt_dents(bore: Bore) -> list[Warned]:
-    """Warn of a section that is dented inwards over some metres: what hangs before a wall was taken for the wall.
+    """Warn of a crown that is dented inwards over some metres: what hangs under it was taken for the lining.
 
     The depth is that of the section below its convex hull, along the radius.
     """
@@ -251,17 +252,17 @@ def _doubt_dents(bore: Bore) -> list[Warned]:
         corners = ConvexHull(np.column_stack([y[row], z[row]])).vertices
         corners = corners[np.argsort(bore.angle[corners])]
         depth[row] = _hull_radius(bore.angle, bore.angle[corners], bore.radius[row, corners]) - bore.radius[row]
+    depth[:, np.sin(bore.angle) < _OVERHEAD] = 0.0
     result = []
     for first, last in find_runs(depth.max(axis=1) > _DENT) - np.array([0, 1]):
         start, end = float(bore.station[first]), float(bore.station[last])
         if end - start < _DENT_LENGTH:
             continue
         here = depth[first : last + 1]
-        deepest, sides = here.max(), name_sides(bore.angle, np.maximum(here.mean(axis=0) - _DENT / 2, 0.0))
         result.append(Warned(
             Code.DENT,
-            f"{name_span(start, end)} the section is dented inwards by up to {deepest:.1f} m at the {sides}: a duct, "
-            "pipes, a platform or cabinets may have been taken for the wall",
+            f"{name_span(start, end)} the section is dented inwards by up to {here.max():.1f} m at the crown: a duct, "
+            "pipes or lamps may have been taken for the lining",
             start, end,
         ))  # fmt: skip
     return result

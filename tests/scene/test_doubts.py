@@ -126,6 +126,10 @@ def test_a_duct_that_was_taken_for_the_crown_dents_the_section(bore):
     shallow = bore.radius.copy()
     shallow[20:60, near] -= 0.1
     assert codes(replace(bore, radius=shallow)) == {}
+    corridor = np.minimum(2.5 / np.abs(np.cos(bore.angle)), 3.0 / np.abs(np.sin(bore.angle)))
+    void = np.sin(bore.angle) > 0.3  # an open ceiling, wider than the corridor under it
+    corridor[void] = np.minimum(3.2 / np.abs(np.cos(bore.angle)), 4.0 / np.sin(bore.angle))[void]
+    assert "dent" not in codes(replace(bore, radius=np.repeat(corridor[None], len(bore.station), axis=0)))
     short = bore.radius.copy()
     short[20:28, near] -= 0.9
     assert codes(replace(bore, radius=short)) == {}

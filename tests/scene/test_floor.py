@@ -135,6 +135,16 @@ def test_an_even_run_leaves_out_what_stands_on_the_floor_and_takes_the_lower_of_
     assert floor._even_run([[], []]) == []
 
 
+@pytest.mark.parametrize(("plateau", "lower"), [(0.0, False), (0.02, False), (0.22, True)])
+def test_a_lower_floor_is_one_that_lies_well_below_the_first(plateau, lower):
+    rng = np.random.default_rng(2)
+    across = rng.uniform(-2.6, 2.6, 4000)
+    low = np.where(np.abs(across) < 1.3, plateau - 2.0, -2.0) + rng.normal(0.0, 0.004, 4000)
+    found = floor.find_lower_line(across, low, (plateau - 2.0, 0.0))
+    assert (found is not None) == lower
+    assert not lower or found[0] == pytest.approx(-2.0, abs=0.01)
+
+
 def test_without_the_search_below_the_floor_would_be_a_plateau_over_the_track(monkeypatch):
     monkeypatch.setattr(floor, "find_lower_line", lambda *_: None)
     world = World(arch(5.1, 5.5, 3.0), L, PROUD)
