@@ -9,12 +9,7 @@ from typing import Any
 
 from scene.progress import Stages
 
-_CHUNK = 1 << 22
-
-
-def total_bytes(paths: list[Path]) -> int:
-    """Return the bytes of all inputs, a folder's files included."""
-    return sum(file.stat().st_size for path in paths for file in input_files(path))
+_CHUNK = 1 << 22  # bytes read at once
 
 
 def input_record(paths: list[Path], advance: Callable[[int], None] = lambda _: None) -> list[dict[str, Any]]:
@@ -27,8 +22,9 @@ def input_record(paths: list[Path], advance: Callable[[int], None] = lambda _: N
 
 
 def hash_inputs(paths: list[Path], progress: Stages) -> list[dict[str, Any]]:
-    """Return name, size and hash of each input, read once from end to end."""
-    return input_record(paths, progress.start("hashing the input, bytes", total_bytes(paths)).advance)
+    """Return the record of some inputs, as a stage of a build."""
+    total = sum(file.stat().st_size for path in paths for file in input_files(path))
+    return input_record(paths, progress.start("hashing the input, bytes", total).advance)
 
 
 def library_versions(names: tuple[str, ...]) -> dict[str, str]:
@@ -45,17 +41,13 @@ def input_files(path: Path) -> list[Path]:
     return [file for file in sorted(path.iterdir()) if file.is_file()] if path.is_dir() else [path]
 
 
-def _sha256(path: Path, advance: Callable[[int], None]) -> str:
+def _file_record(path: Path, advance: Callable[[int], None]) -> dict[str, Any]:
     digest = hashlib.sha256()
     with path.open("rb") as file:
         while block := file.read(_CHUNK):
             digest.update(block)
             advance(len(block))
-    return digest.hexdigest()
-
-
-def _file_record(path: Path, advance: Callable[[int], None]) -> dict[str, Any]:
-    return {"file": path.name, "bytes": path.stat().st_size, "sha256": _sha256(path, advance)}
+    return {"file": path.name, "bytes": path.stat().st_size, "sha256": digest.hexdigest()}
 
 
 def _folder_record(path: Path, advance: Callable[[int], None]) -> dict[str, Any]:

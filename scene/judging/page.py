@@ -3,7 +3,6 @@
 Its drawings are SVG: plan, profile, strips along the bore, and sections with the returns over them.
 """
 
-from collections.abc import Iterable
 from html import escape
 from typing import Any
 
@@ -36,8 +35,8 @@ def draw_plan(bore: Bore, returns: Returns | None) -> str:
         rows = _sample(len(returns.kind), _PLAN_POINTS)
         points, kinds = _plan_points(bore, returns, rows) @ rotate, returns.kind[rows]
     line = plan @ rotate
-    low, high = (np.array([f(v[:, k] for v in walls) for k in (0, 1)]) for f in (_least, _most))
-    low, high = low - 6.0, high + 6.0
+    both = np.concatenate(walls)
+    low, high = both.min(axis=0) - 6.0, both.max(axis=0) + 6.0
     inside = ((points > low) & (points < high)).all(axis=1) if len(points) else np.empty(0, bool)
     scale = (_WIDTH - 2 * _MARGIN) / (high[0] - low[0])
     height = (high[1] - low[1]) * scale + 30
@@ -100,14 +99,6 @@ def draw_section(bore: Bore, returns: Returns, start: float, end: float) -> str:
     parts.append(f'<path d="M8 {tall - 8:.0f}h{scale:.1f}" stroke="#111" stroke-width="2"/>')
     parts.append(f'<text x="8" y="{tall - 12:.0f}">1 m</text>')
     return _svg(float(across), float(tall), parts)
-
-
-def _least(values: Iterable[np.ndarray]) -> float:
-    return float(min(v.min() for v in values))
-
-
-def _most(values: Iterable[np.ndarray]) -> float:
-    return float(max(v.max() for v in values))
 
 
 def _plan_points(bore: Bore, returns: Returns, rows: np.ndarray) -> Float[np.ndarray, "k 2"]:
@@ -208,16 +199,9 @@ def render_page(name: str, bore: Bore, judgement: Judgement, content: dict[str, 
 
 
 def _warnings(judgement: Judgement) -> list[str]:
-    if not judgement.warnings:
-        return ['<p class="good">None: nothing of any size is unexplained, unseen or odd.</p>']
-    return [
-        f'<p class="warn{" grave" if warning.refuses else ""}">{text(_sentence(warning.text))}</p>'
-        for warning in judgement.warnings
-    ]
-
-
-def _sentence(words: str) -> str:
-    return f"{words[:1].upper()}{words[1:]}."
+    shown = [(" grave" if one.refuses else "", f"{one.text[:1].upper()}{one.text[1:]}.") for one in judgement.warnings]
+    none = ['<p class="good">None: nothing of any size is unexplained, unseen or odd.</p>']
+    return [f'<p class="warn{grave}">{text(words)}</p>' for grave, words in shown] or none
 
 
 def _sections(bore: Bore, judgement: Judgement) -> list[str]:
@@ -264,9 +248,6 @@ def make_table(title: str, rows: list[Any]) -> str:
     """Return a table below its heading; nothing where it has no rows."""
     if not rows:
         return ""
-    cells = "".join(f"<tr>{''.join(f'<td>{text(_short(cell))}</td>' for cell in row)}</tr>" for row in rows)
+    shown = [[f"{cell:.5g}" if isinstance(cell, float) else text(cell) for cell in row] for row in rows]
+    cells = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in shown)
     return f"<h2>{title}</h2><table>{cells}</table>"
-
-
-def _short(value: Any) -> Any:
-    return f"{value:.5g}" if isinstance(value, float) else value
