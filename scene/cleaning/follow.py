@@ -24,13 +24,13 @@ _MOST = 60  # places
 _REACH = 10.0  # m around a place whose returns tell the direction
 _CELL = 0.25  # m
 _SLAB = 3.0  # m before and behind a place that draw the ring
-_HEADINGS = 24
+_HEADINGS = 24  # tried over half a turn
 _SLOPES = np.tan(np.deg2rad([-18, -12, -6, 0, 6, 12, 18]))
-N_RAYS = 72
+N_RAYS = 72  # directions around a section
 _LUMENS = 6  # open middles tried at a place
 _LEAST_CLEARANCE = 0.5  # m
 _FURTHEST = 15.0  # m
-_MOST_POINTS = 6000
+_MOST_POINTS = 6000  # about a place that tell its direction
 
 
 @dataclass(frozen=True)
@@ -174,7 +174,7 @@ _SIZE = 2.2  # times the template
 _LONGEST_GAP = 15  # m without an enclosing section
 _PULL = 3.0  # bins that the prediction counts for
 _MIN_RETURNS = 12  # in a slab; fewer are a gap
-_ROUNDS = 3
+_ROUNDS = 3  # times that a section is laid on its template
 _AROUND = 10  # sections on each side of unsteady ones that tell where they are
 _TURN = bin_angles(N_RAYS)
 

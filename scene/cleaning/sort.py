@@ -119,8 +119,8 @@ def _footprint(around: Around, standing: Bool[np.ndarray, " n"]) -> Bool[np.ndar
     return np.isin(key, np.unique(key[standing]))
 
 
-_NEIGHBOURS = 4
-_SAMPLE = 20_000
+_NEIGHBOURS = 4  # of a point that has support
+_SAMPLE = 20_000  # points that tell the usual distance
 _FURTHER = 3.0  # times the usual distance to that neighbour
 _LEAST = 0.15  # m
 

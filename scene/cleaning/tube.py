@@ -17,12 +17,12 @@ from scene.geometry import Around, bin_angles
 
 ROW = 0.5  # m
 _OVERRUN = 4.0  # m beyond the axis that may still be bore
-COLUMNS = 120
+COLUMNS = 120  # directions
 _BIN = 0.1  # m of radius
 _USUAL, _PRESENT, _BRIEF = 40.0, 4.0, 1.0  # m before and behind a station
 _PERSISTENT = 0.4  # share of the rows seen
 _MOSTLY = 0.5  # the same for the usual section
-_LEAST_ROWS = 3
+_LEAST_ROWS = 3  # that show what persists
 _DIFFERENT = 0.3  # m
 _LAYBY = 7.0  # m: shorter is a niche
 _LONGER = (1 - 2 * _PERSISTENT) * (2 * _PRESENT + ROW)  # m by which what persists is longer than what is there
@@ -213,7 +213,7 @@ def _attached(narrower: np.ndarray, present: np.ndarray, wall: np.ndarray) -> Bo
 _OVERHEAD = 0.35  # sine of the lowest direction: what stands on the floor or leans on a wall is told elsewhere
 _EDGE = 0.4  # m at both edges
 _WITHIN_LINE = 0.3  # m within the line between them
-_WIDEST_HANGING = np.deg2rad(60.0)
+_WIDEST_HANGING = np.deg2rad(60.0)  # rad, of a thing under a ceiling
 
 
 def bridge_hanging(

@@ -14,14 +14,14 @@ from scene.errors import FitError, Refusal
 from scene.fitting.floor import fit_floor_line, floor_radius
 from scene.geometry import Axis, angle_bins, arc_length, axis_through, bin_medians, measure_section, section_angles
 
-_OVERRUN = 6.0
+_OVERRUN = 6.0  # m beyond the axis that are looked at
 _THIN_SHARE, _THIN = 0.05, 20  # of the usual number of points, and points: a section that is hardly seen has fewer
 _UNUSUAL, _ROUGH = 0.3, 6.0  # m from the usual section, and standard deviations of the wall about it
-_SPACING = 1.0
-_PASSES = 4
-_COARSE_ANGLES = 72
-_POINTS_PER_METRE = 5_000
-_MIN_SEEN = 0.6
+_SPACING = 1.0  # m between sections
+_PASSES = 4  # times that the axis is pulled to the middle
+_COARSE_ANGLES = 72  # directions of a section
+_POINTS_PER_METRE = 5_000  # more say no more of a middle
+_MIN_SEEN = 0.6  # share of the directions of a section that counts
 _FURTHEST = 2.0  # times the median radius of a section: further is a passage, which has no part in its middle
 _DOWN, _TRACK = -0.8, 0.5  # directions in which sleepers and rails may hide the bed, and how deep, m
 

@@ -29,7 +29,7 @@ CLEAR = 0.32  # score of a hole that nobody doubts
 MIN_DEPTH = 0.06  # m behind the wall that no wall reaches
 MODES = ("nearest", "wrap")
 _PROFILE = 0.30  # half window for the common size, m
-_SIDE = 0.5
+_SIDE = 0.5  # weight of a return behind the wall against a missing one on it
 _OVERSHOOT = 0.7  # of the wall's spread: how far the deepest of a few returns lies beyond the surface, measured
 _DEEP_SHARE = 0.75  # quantile over pockets of their deepest return
 

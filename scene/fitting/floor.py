@@ -11,12 +11,12 @@ from scene.geometry import Axis
 
 # What lies a little above the line may be track or clutter; what lies below is noise.
 _GATES = ((-0.15, 0.10), (-0.08, 0.05), (-0.05, 0.04), (-0.04, 0.04))
-_START_PERCENTILE = 20
-_CLUTTER = 0.45
-_MIN_POINTS = 30
-_FLAT_SHARE = 0.85
-_INNER = 0.75
-_BESIDE = 0.5
+_START_PERCENTILE = 20  # of the heights of the lower half, where a line begins
+_CLUTTER = 0.45  # m above the floor that track and people explain
+_MIN_POINTS = 30  # points of a line
+_FLAT_SHARE = 0.85  # of the bottom that a line explains
+_INNER = 0.75  # of the half width: further out are corners
+_BESIDE = 0.5  # of the half width: further in is track
 
 
 def fit_floor_line(lateral: Float[np.ndarray, " n"], upward: Float[np.ndarray, " n"]) -> tuple[float, float] | None:
@@ -172,7 +172,7 @@ _FITTED = (0.20, 1.10)  # heights above the floor between which a wall is fitted
 _FOOT = 0.45  # below it the fit takes the place of the wall, m
 _BETWEEN = 0.3  # |cos| of the directions that meet the floor between the walls
 _RAILS = 0.7  # of the distance out to the wall
-_NEWTON, _CONVERGED = 6, 0.01
+_NEWTON, _CONVERGED = 6, 0.01  # steps; m
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from scene.fitting.unroll import Grid
 
 _ROW_SHARE = 0.3  # of the fullest row, and of the places in a row
 _PITCHES = (0.9, 2.1)  # widths of rings in use, m
-_MIN_COHERENCE = 0.4
+_MIN_COHERENCE = 0.4  # length of the mean wave of a pitch: 0 by chance, 1 at one place of each ring
 _NEAR_PLACE = 0.12  # m along the bore
 _PLACES = 0.05  # m, step in which places in a ring are counted
 
@@ -96,14 +96,14 @@ def find_ring_joints(station: Float[np.ndarray, " p"], length: float) -> Float[n
 
 
 _HOLE = (4, 3)  # cells of 5 cm × 1°
-_AROUND = (16, 13)
-_EXPECTED = (31, 21)
-_PEAK_WINDOW = (7, 7)
-_WEAK, _FAINT = 0.22, 0.12
+_AROUND = (16, 13)  # cells about a hole that it is compared with
+_EXPECTED = (31, 21)  # cells over which the wall is alike
+_PEAK_WINDOW = (7, 7)  # cells of which one is the middle of a hole
+_WEAK, _FAINT = 0.22, 0.12  # scores of holes that may be pockets, by themselves and by their place
 _MIN_EXPECTED = 0.2  # points a cell; with fewer on the wall a hole says nothing
 FLOOR_MARGIN = 0.45  # m above the floor
 _ROW_WIDTH = 0.15  # m
-_MIN_POCKETS = 6
+_MIN_POCKETS = 6  # with fewer there is no lining
 _MIN_SEEN = 0.6  # of the wall
 _NOISE_SHARE = 0.25  # of the depth
 _RIB = 0.02  # least wall left between two pockets, and before a mouth, m

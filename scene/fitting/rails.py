@@ -31,13 +31,13 @@ _CLEAR_FACE = (0.016, 0.032)  # the same of single returns, clear of the rounded
 _TOP = 0.010  # above and below the top of the head, m
 _FACE_BAND = 0.015  # m between the edge of the top and the face below it
 _FACE_BLUR = 0.004  # m
-_FACE_RETURNS = 12
+_FACE_RETURNS = 12  # of one face of a head
 # m: spread of the returns from the top of a head, 0.021 for 73 mm and 0.024 with a carried LiDAR's noise. Where poses
 # blur it more, a face may look sharp that is a centimetre off.
 _HEAD_SHARP = 0.025
 _FACE_SHARP = 0.006  # m: spread of returns about the face; twice 15 mm of band, evenly filled, have 0.0087
 _PIECE = 8.0  # m of track of which one gauge is measured
-_LEAST_PIECES = 2
+_LEAST_PIECES = 2  # of track that show a gauge
 _SURE = 0.003  # standard error of a gauge that counts as measured, m
 _PIECES_AGREE = 0.004  # spread of the pieces, m: where poses blur the faces all pieces err alike, and more do not help
 _FEW_PIECES = 6  # whose spread is their standard deviation: three agree with their median by chance

@@ -16,9 +16,9 @@ from scene.fitting.unroll import UNSEEN_GROWTH, probability_known
 from scene.geometry import arc_length, axis_through, section_angles
 from scene.reading.ringsurvey import RingSurvey
 
-_MIN_POINTS = 5
-_LARGEST_RESIDUAL = 0.25
-_PASSES = 3
+_MIN_POINTS = 5  # points of a ring
+_LARGEST_RESIDUAL = 0.25  # m rms: with more it is no circle
+_PASSES = 3  # times that a ring is fitted in the plane square to the axis
 _RADII = (0.5, 15.0)  # m
 _LEAST_SPACING = 0.05  # m
 _LONGEST_GAP = 50.0  # m; across more, nobody knows how the tunnel runs

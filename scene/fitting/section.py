@@ -21,9 +21,9 @@ from scene.geometry import N_ANGLES, Around, Axis, angle_bins, find_runs
 DENSE_STEP = 0.25  # m; where fewer than most rows of this length were seen, the survey is a row of profiles
 OVERRUN = 3.0  # m beyond the axis that are looked at
 _GAP = 2.0  # m unseen along the bore: longer is a gap of the survey, and no distance of its profiles
-_END_COVERAGE = 0.4
-_DENSE = 0.7
-_TRIM_STEP = 0.05
+_END_COVERAGE = 0.4  # share of the directions that a row of the bore shows
+_DENSE = 0.7  # share of the rows that a dense survey shows
+_TRIM_STEP = 0.05  # m
 
 
 def visible_span(station: np.ndarray, angle: np.ndarray, axis: Axis) -> tuple[float, float]:
@@ -64,7 +64,7 @@ def _trim_end(station: np.ndarray, end: float, behind: float) -> float:
 
 
 _ASLANT = 0.10  # m between the mouth on most of the girth and its outermost rim
-_MOUTH_COLUMNS = 24
+_MOUTH_COLUMNS = 24  # directions
 
 
 def _trim_aslant(station: np.ndarray, angle: np.ndarray, end: float) -> float:
@@ -84,13 +84,13 @@ def _trim_aslant(station: np.ndarray, angle: np.ndarray, end: float) -> float:
     return most if most > end + _ASLANT else end
 
 
-_COARSE_ANGLES = 120
+_COARSE_ANGLES = 120  # directions of the first wall
 _THIN_STEPS = (0.5, 1.0)  # m; rows of the first wall where a cloud is too thin for shorter ones
 _FINE = (0.05, N_ANGLES)
 _MEDIAN_WINDOW = (1.25, 5)  # m along, 3° columns around: a pocket fills less than a tenth of it
 _SIGMA = (0.15, 1.5)  # m along, columns around
 _NEAR_WALL = 0.05  # cells further than this from the first wall are pockets or clutter
-_ON_WALL = 0.035
+_ON_WALL = 0.035  # m from the wall: nearer returns are on it
 _LARGE_HOLE = 4.0  # cells
 _GOES_ON = 1.0  # m that a wall goes on as it was, where it is unseen from there to the end
 _ALONG = 1.25  # m before and behind a cell that tell an edge from a pocket
@@ -99,7 +99,7 @@ _WIDE = 6  # columns
 _STEEP, _EDGE = 0.25, 1.0  # of the radius, within 4 columns; m that the first wall may be off there
 _DEEPEST = 0.40  # further out is no recess of a lining, m
 _SEEN_WEIGHT = 0.02  # returns a cell: with fewer around, the first wall stands
-_MIN_COVERAGE = 0.5
+_MIN_COVERAGE = 0.5  # share of the cells of the first wall
 _HOLLOW, _MIN_HOLLOW = 0.5, 0.7  # m from the wall, share of the points
 
 

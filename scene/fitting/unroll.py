@@ -10,7 +10,7 @@ from scipy.special import erf
 from scene.geometry import angle_bins, bin_angles
 
 _RADIUS_STEP = 1.0 / (1 << 14)  # 0.06 mm, so that a cell and a radius fit one sortable word
-_RADIUS_BITS = 20
+_RADIUS_BITS = 20  # up to 64 m
 
 
 @dataclass(frozen=True)

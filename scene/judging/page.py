@@ -17,7 +17,7 @@ from scene.judging.returns import BEHIND, BEYOND, EXPLAINED, INSIDE, Returns
 COLOURS = {EXPLAINED: "#9aa5b1", INSIDE: "#d64545", BEHIND: "#2f6fde", BEYOND: "#c9a227"}
 _WALL = "#111827"
 _WIDTH = 1000  # of a drawing along the bore, in units of the picture
-_MARGIN = 45
+_MARGIN = 45  # units of the picture
 _PLAN_POINTS, _SECTION_POINTS = 6000, 1500  # of each picture, so that the page stays light
 _SEEN_AROUND = 2.0  # m beyond the wall that a section's picture shows
 

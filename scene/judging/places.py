@@ -164,7 +164,7 @@ def _look_behind(sides: str, furthest: float, length: float, whole: float) -> st
 
 
 ROW = 1.0  # m
-SECTORS = 36
+SECTORS = 36  # directions
 _SPARSE = 0.03  # of the usual number of returns of a cell: with fewer it was not seen, as stray returns are everywhere
 _MIN_AREA = 3.0  # m² of wall in one piece: a smaller one is a shadow that its neighbours tell about
 _MIN_LENGTH, _MIN_GIRTH = 1.5, 0.9  # m

@@ -24,7 +24,7 @@ from scene.writing.track import Track
 
 _BOTTOM = np.deg2rad(28)  # to each side of straight down: floor
 _FLAT_FLOOR = 0.02  # m rms about a line: with more it is no flat floor
-_LEAST_LEAN = np.deg2rad(1.2)
+_LEAST_LEAN = np.deg2rad(1.2)  # rad: less is a floor as built
 _ALIKE = np.deg2rad(0.6)  # about the usual lean
 _MOST_OF_IT = 0.8  # share of the stations that lean alike
 # From straight up, to both sides: walls; what hangs under a crown is on one side

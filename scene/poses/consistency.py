@@ -23,7 +23,7 @@ from scene.reading.times import Scan
 _PLACES = (0.25, 0.5, 0.75)  # of the recording
 _SCANS, _EVERY = 5, 15  # sweeps at each place, and how far apart
 _POINTS = 2500  # of each sweep
-_QUERIES, _NEIGHBOURS = 300, 16
+_QUERIES, _NEIGHBOURS = 300, 16  # points of a scan that are looked at, and points about each that tell a wall
 _LONGEST = 25.0  # m; returns further away are far apart
 _BLURRED, _LEAST = 1.3, 0.012  # times the thickness in a sweep, and m, from which walls count as blurred
 _THICKEST, _WORSE, _LEAST_WORSE = 0.8, 1.35, 0.015  # quantile; the same limits for the thickest fifth

@@ -23,7 +23,7 @@ IMU_TYPE = "sensor_msgs/msg/Imu"
 GRAVITY = 9.80665  # m/s²
 # A carried or driven IMU averages one g over a recording. Livox publishes g, the others m/s².
 _IN_G, _IN_SI = (0.7, 1.4), (0.7 * GRAVITY, 1.4 * GRAVITY)
-_MIN_SAMPLES = 50
+_MIN_SAMPLES = 50  # of an IMU that is used
 
 
 @dataclass(frozen=True)

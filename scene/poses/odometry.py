@@ -20,7 +20,7 @@ from scene.reading.recording import Recording
 from scene.reading.times import Scan
 
 LIBRARY = "small-gicp"
-MIN_POINTS = 100
+MIN_POINTS = 100  # points of a scan that can be matched
 _RANGE = 60.0  # m
 _THINNING, _VOXEL, _REACH = 0.25, 0.5, 1.0  # m: of a sweep, of the map, of a correspondence
 _NEIGHBOURS = 10  # whose spread is a point's covariance

@@ -17,7 +17,7 @@ from scene.poses.trajectory import Control
 
 _YAWS = np.deg2rad(np.arange(0, 360, 45))
 _TRIAL = 60.0  # s of the recording on which the mounting's heading is tried out
-_TRIAL_ITERATIONS, _ITERATIONS = 8, 25
+_TRIAL_ITERATIONS, _ITERATIONS = 8, 25  # Gauss-Newton steps, of a guess of the heading and of the solution
 _CONVERGED = 1e-6  # rad and m
 _BIAS = (0.02, 0.3)  # rad/s, m/s²: biases that a MEMS gyro and accelerometer may start with
 # Standard deviation of a position against the mean of two velocities, m: jerk · step³ / 12 of a walker's stride.

@@ -107,7 +107,7 @@ class NormalEquations:
             raise FitError(why, Refusal.POSES) from error
 
 
-KNOT_SIZE = 15
+KNOT_SIZE = 15  # unknowns of a state: attitude, position, velocity, two biases
 _TURN, _SHIFT, _SPEED, _GYRO, _ACCEL = (slice(3 * k, 3 * k + 3) for k in range(5))
 _EYE = np.eye(3)
 

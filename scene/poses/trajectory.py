@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from scene.errors import RecordingError, require_input
 
-_QUATERNION_TOLERANCE = 0.01
+_QUATERNION_TOLERANCE = 0.01  # by which the length of a quaternion may differ from 1
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def load_tum(path: Path) -> Trajectory:
     return Trajectory(rows[:, 0], rows[:, 1:4], Rotation.from_quat(rows[:, 4:]), str(path))
 
 
-_MIN_CONTROL_ROWS = 10
+_MIN_CONTROL_ROWS = 10  # of a control within the recording
 _MIN_CONTROL_EXTENT = 3.0  # m; less than a bore is wide, and no heading comes of it
 MIN_CONTROL_SHARE = 0.5  # of the recording's time
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 DEGREES = "degrees"
 _CODES = {9001: "m", 9002: "ft", 9003: "us-ft"}
-_MODEL, _GEOGRAPHIC, _LINEAR, _VERTICAL = 1024, 2, 3076, 4099
+_MODEL, _GEOGRAPHIC, _LINEAR, _VERTICAL = 1024, 2, 3076, 4099  # keys of GeoTIFF, and its value for degrees
 _SYSTEMS, _USER_DEFINED = (3072, 4096), 32767  # keys of the projected and the vertical system; a code that is none
 _WKT_UNIT = re.compile(r'\b(?:LENGTH)?UNIT\[\s*"([^"]*)"\s*,\s*([-+.\deE]+)')
 _SAME_FACTOR = 1e-6  # a foot and a US survey foot differ by 2e-6

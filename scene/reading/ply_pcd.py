@@ -11,7 +11,7 @@ from pypcd4.pypcd4 import Encoding, MetaData
 
 from scene.reading.source import CloudSource, Lines, source_from_records, source_from_text
 
-_HEADER_LIMIT = 1 << 16
+_HEADER_LIMIT = 1 << 16  # bytes; a longer header is none
 _PLY_BYTES = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "float": 4, "double": 8}
 _PLY_BYTES |= {"int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "int32": 4, "uint32": 4, "float32": 4, "float64": 8}
 

@@ -20,7 +20,7 @@ from scene.reading.source import UNIT_NAMES, UNITS, cause, refuse_damage
 from scene.reading.tables import find_column, find_xyz, is_map_name, plain_name
 
 TABLE_SUFFIXES = (".csv", ".txt", ".xlsx")
-_MOST_CELLS = 64
+_MOST_CELLS = 64  # cells of a row that are read
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def _xlsx_sheet(sheet: Any) -> Sheet:
 
 
 NEEDED = "EASTING, NORTHING, ELEVATION with POINT (ring.point), or with RING NO. and POINT NO."
-_MIN_RINGS = 4
+_MIN_RINGS = 4  # with fewer a table is no ring survey
 _SHOWN = 100  # characters of a wrong header
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from subterra_jax.host.errors import SubterraError
 
-_LONGEST_CAUSE = 200
+_LONGEST_CAUSE = 200  # characters of a message of a library
 
 
 def one_line(text: str) -> str:

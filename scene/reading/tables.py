@@ -96,8 +96,8 @@ def find_xyz(names: Sequence[str], told: dict[str, str] | None = None) -> tuple[
     return at, next(iter(units), None)
 
 
-_HEAD_BYTES = 1 << 16
-_PROBES = 16
+_HEAD_BYTES = 1 << 16  # of a file by which its layout is told
+_PROBES = 16  # places of a file that are looked at
 _DELIMITERS = ((";", "semicolon"), ("\t", "tab"), (",", "comma"))
 
 

@@ -18,7 +18,7 @@ from scene.writing.track import Track, wall_offset
 from scene.writing.unrolled import recess_boxes, unroll_section
 from scene.writing.walls import Opening
 
-_ROBOT_HEIGHT = 1.0
+_ROBOT_HEIGHT = 1.0  # m: what begins lower a robot may run into
 _ASIDE = 0.3  # m: a third rail by standard belongs to a track on the axis
 
 

@@ -16,7 +16,7 @@ DECK = 2  # a smooth deck at the top of the sleepers, for wheels; not really the
 GROUND = 4  # bed, sleepers and rails alone, for legs
 LOW_WALL = 8  # lining and furniture at robots' height alone, a few panels, so that MJX has few pairs to test
 
-_DIGITS = 5
+_DIGITS = 5  # behind the point of a coordinate in m
 
 
 def add_element(parent: ET.Element, tag: str, **attributes: str) -> ET.Element:

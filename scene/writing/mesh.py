@@ -13,7 +13,7 @@ from scene.fitting.assemble import find_fold
 from scene.writing import unrolled
 from scene.writing.unrolled import Sheet, Unrolled
 
-_MOUTH_TOLERANCE = 1e-4
+_MOUTH_TOLERANCE = 1e-4  # m from the plane of a mouth
 
 
 def build_solid(bore: Bore, pockets: bool) -> Manifold:

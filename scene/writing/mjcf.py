@@ -36,7 +36,7 @@ from scene.writing.trackgeoms import add_nails, add_slabs, add_track
 from scene.writing.walls import add_low_panels, add_niche, add_patches
 
 _SEGMENTS = 6  # of a ring
-_STONES = 900
+_STONES = 900  # in the picture of the ballast
 
 
 def write_png(path: Path, picture: UInt8[np.ndarray, "height width 3"]) -> None:

@@ -21,8 +21,8 @@ from scene.writing.track import Track
 _PATCH_TOLERANCE = 0.015  # of a patch from its wall, m
 _STRETCH = 6.0  # longest patch, m
 _LEAST = 3  # points along a patch's side below which it is not divided
-_OVERLAP = 0.01
-_THICKNESS = 0.10
+_OVERLAP = 0.01  # m by which panels reach over their edges
+_THICKNESS = 0.10  # m of a panel
 _ON_BED = 0.03  # wall this little above the bed is floor, m
 
 
@@ -130,8 +130,8 @@ def _divide_patch(points: Float[np.ndarray, "r c 3"], above: Float[np.ndarray, "
     panels.append(Panel(centre + frame @ middle, Rotation.from_matrix(frame), half_size, span))
 
 
-_LINE_TOLERANCE = 0.02
-_HEIGHT = 2.5
+_LINE_TOLERANCE = 0.02  # m from the polyline of a wall
+_HEIGHT = 2.5  # m of a low panel
 _DEPTH = 0.3  # below the top of the sleepers
 
 
