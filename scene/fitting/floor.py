@@ -72,7 +72,7 @@ _SLOPES = np.linspace(-0.06, 0.06, 7)
 _LEAST_SHARE = 0.1  # of the returns of a strip of floor, in a strip that shows it
 _LEAST_EXTENT, _MOST_DEEPER = 0.15, 0.2  # of the strips, shown on the floor and below it: a drain is narrower
 _BESIDE_PLATFORM, _FLOOR_BESIDE = 0.6, 0.35  # of the strips, near the floor and on it, where a platform stands on it
-_LOWER = 0.05  # m
+_LOWER = 0.05  # m that a lower floor lies below the first line
 _NEAR = 0.04  # m
 
 
