@@ -7,11 +7,12 @@ Example: python -m scene.limits fitting.floor judging
 
 import ast
 import io
-import sys
 import tokenize
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
+
+import tyro
 
 _SIMPLE = (ast.Constant, ast.Tuple, ast.UnaryOp, ast.BinOp, ast.operator, ast.unaryop, ast.expr_context)
 
@@ -51,6 +52,15 @@ def _is_numbers(value: ast.expr) -> bool:
     return all(isinstance(node, _SIMPLE) for node in nodes) and all(isinstance(n, int | float) for n in numbers)
 
 
-if __name__ == "__main__":
-    for limit in list_limits(*sys.argv[1:]):
+def show(parts: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[PART ...]")] = (), /) -> None:
+    """Prints the thresholds of a build with their units and reasons.
+
+    Args:
+        parts: Packages, or modules such as fitting.floor; all where none is given.
+    """
+    for limit in list_limits(*parts):
         print(f"{limit.part:20} {limit.name} = {limit.value}  # {limit.words}")
+
+
+if __name__ == "__main__":
+    tyro.cli(show, prog="python -m scene.limits")

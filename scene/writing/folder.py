@@ -43,7 +43,7 @@ class Reconstruction:
     cloud: Cloud | None = None  # The bore's part of the registered cloud, where there was one
     everything: Cloud | None = None  # The registered cloud before cleaning
     removed: tuple[Removed, ...] = ()  # What cleaning cut away, by station of the bore, m
-    cause: np.ndarray | None = None  # `scene.cleaning.removed.Cause` of each point of `everything`, `(n,)`
+    cause: np.ndarray | None = None  # `scene.errors.Cause` of each point of `everything`, `(n,)`
     seen: SeenTrack = field(default_factory=SeenTrack)  # Tracks that the cloud shows
 
 
