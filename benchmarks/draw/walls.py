@@ -3,12 +3,14 @@
 `python -m benchmarks.draw walls --out docs/walls.png`
 """
 
+import io
 from dataclasses import dataclass
 from pathlib import Path
 
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
+from PIL import Image
 
 import subterra_jax as st
 from benchmarks.command import run_main
@@ -20,6 +22,8 @@ from subterra_jax.procedural.open_world import HELD_OUT, UNSEEN, plan
 
 _BEGIN, _END, _STEP = 14.0, 26.0, 0.25  # m: wall that is drawn; distance between two scans
 _CELLS = (240, 176)  # along, around
+_EXTENT = (_BEGIN, _END, -180.0, 180.0)
+_GREYS = 12  # of a picture, to keep it small
 
 
 @dataclass(frozen=True)
@@ -42,14 +46,16 @@ def run(config: WallsConfig) -> None:
         station, turn = np.linspace(_BEGIN, _END, _CELLS[0]), np.linspace(-np.pi, np.pi, _CELLS[1])
         drawn = np.log(brightness(np, station[None], turn[:, None], seed, config.texture))
         for panel, picture in zip(row, (read(tunnel, config.texture), drawn), strict=True):
-            panel.imshow(picture, cmap="gray", vmin=-0.8, vmax=0.6, aspect="auto", extent=(_BEGIN, _END, -180, 180))
+            panel.imshow(picture, cmap="gray", vmin=-0.8, vmax=0.6, aspect="auto", origin="lower", extent=_EXTENT)
             panel.set_yticks([-90, 0, 90], ["right", "crown", "left"])
         row[0].set_ylabel(kind)
     axes[0, 0].set_title("intensities of a VLP-16, incidence taken out")
     axes[0, 1].set_title("brightness of the lining")
     axes[-1, 0].set_xlabel("station, m")
     axes[-1, 1].set_xlabel("station, m")
-    write_file(config.out, png_bytes(figure, dpi=80))
+    small = io.BytesIO()
+    Image.open(io.BytesIO(png_bytes(figure, dpi=70))).convert("L").quantize(_GREYS).save(small, "png", optimize=True)
+    write_file(config.out, small.getvalue())
 
 
 def read(tunnel: st.TunnelPlan, texture: float) -> np.ndarray:

@@ -183,8 +183,7 @@ def _wall_picture(piece: Piece, shell: Shell, seed: int) -> tuple[np.ndarray, tu
     height = np.median(np.interp(station + shell.window[0], shell.station, shell.position[:, 2]) - ground)
     angle = wall_angle(np, reach * np.cos(turn), reach * np.sin(turn) + height)
     shade = np.clip(0.8 * brightness(np, station[None], angle[:, None], seed, piece.texture), 0.0, 1.0)
-    # MuJoCo counts rows from the top.
-    pixels = np.repeat((255.0 * shade[::-1]).astype(np.uint8)[..., None], 3, axis=2)
+    pixels = np.repeat((255.0 * shade).astype(np.uint8)[..., None], 3, axis=2)
     return pixels, (len(station) * _PIXEL, 2.0 * np.pi * radius)
 
 

@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial import KDTree
 
 import subterra_jax as st
+from subterra_jax.host.texture import brightness, wall_angle
 from subterra_jax.pictures.camera import TunnelChoice
 from subterra_jax.pictures.stage import Piece, carrier_parts, stage_spec
 from subterra_jax.pictures.surfaces import short_shell, tunnel_surfaces
@@ -69,6 +70,25 @@ def test_a_stage_is_for_looks_alone(plan):
     assert not model.geom_conaffinity.any()
     assert model.nbody == 1
     assert model.nlight >= 1
+
+
+def test_the_walls_show_the_brightness_that_a_lidar_reads(plan):
+    begin, end = 200.0, 206.0
+    model = stage_spec(Piece(plan, "smooth", begin, end, 1.0)).compile()
+    wide, high, first = (int(part[1]) for part in (model.tex_width, model.tex_height, model.tex_adr))
+    pixels = model.tex_data[first : first + 3 * wide * high].reshape(high, wide, 3)[..., 0]
+    (wall,) = (one for one in tunnel_surfaces(plan, "smooth", begin, end) if one.name == "wall")
+    mesh = int(model.geom_dataid[model.geom("tunnel wall").id])
+    place = model.mesh_texcoord[model.mesh_texcoordadr[mesh] :][: model.mesh_texcoordnum[mesh]] % 1.0
+    assert len(place) == len(wall.rolled)
+    seen = pixels[(place[:, 1] * high).astype(int), (place[:, 0] * wide).astype(int)]
+    node = KDTree(plan.centre).query(wall.triangles.vertices[:, :2])[1]
+    away, tangent = wall.triangles.vertices[:, :2] - plan.centre[node], plan.tangent[node]
+    station = plan.station[node] + np.sum(away * tangent, axis=1)
+    left = tangent[:, 0] * away[:, 1] - tangent[:, 1] * away[:, 0]
+    angle = wall_angle(np, left, wall.triangles.vertices[:, 2] - plan.elevation[node])
+    expected = brightness(np, station, angle, plan.texture, 1.0)
+    assert np.corrcoef(seen, expected)[0, 1] > 0.7
 
 
 def test_each_tunnel_of_a_list_is_drawn_by_its_number(plan):
