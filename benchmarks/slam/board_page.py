@@ -50,7 +50,7 @@ def as_markdown(board: dict[str, Any]) -> str:
     lines = []
     for program in sorted(_programs(board), key=lambda one: _rank(rows, one)):
         runs = str(sum(row["program"] == program for row in rows))
-        lines.append([program, runs, *(_cell(median_drift(rows, program, name)) for name in names),
+        lines.append([program, runs, *(_cell(rows, program, name) for name in names),
                       *_sums(rows, program)])  # fmt: skip
     lines.append(["*floor*", "", *(f"{_floor(board, name):.4f}" for name in names), "", "", ""])
     note = (
@@ -103,9 +103,10 @@ def _rank(rows: list[Row], program: str) -> float:
     return float(np.median([row["drift"] if "failed" not in row else 1e9 for row in rows if row["program"] == program]))
 
 
-def _cell(values: tuple[float, float, float] | None) -> str:
-    if values is None:
-        return "failed"
+def _cell(rows: list[Row], program: str, recording: str) -> str:
+    if (values := median_drift(rows, program, recording)) is None:
+        ran = any(row["program"] == program and row["recording"] == recording for row in rows)
+        return "failed" if ran else ""
     middle, low, high = (f"{value:.2f}" if value < 10.0 else f"{value:.0f}" for value in values)
     return middle if low == high else f"{middle} ({low} to {high})"
 
