@@ -31,24 +31,6 @@ def both(change):
 PASSING = [
     "mesh_finite", "mesh_watertight", "mesh_winding_consistent", "mesh_is_volume", "mesh_manifold_status",
 ]  # fmt: skip
-SHARES = [
-    "mesh_boundary_unexpected", "mesh_nonmanifold_edges", "mesh_duplicate_faces", "mesh_degenerate_faces",
-    "mesh_self_intersections",
-]  # fmt: skip
-
-
-@pytest.mark.parametrize("id", PASSING)
-def test_a_sound_tube_passes(id):
-    assert measure(id, good()).value == 1.0
-
-
-@pytest.mark.parametrize("id", SHARES)
-def test_a_sound_tube_has_nothing_wrong(id):
-    assert measure(id, good()).value == 0.0
-
-
-def test_all_of_a_sound_lining_looks_at_the_axis():
-    assert measure("mesh_orientation_frac", good()).value == 1.0
 
 
 def test_a_dropped_face_opens_the_solid_and_shows_as_a_rim():

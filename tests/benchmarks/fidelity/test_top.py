@@ -31,19 +31,6 @@ def placed(size, left=0.0, up=0.0):
 WALL = placed((0.1, 8.0, 8.0))
 PILLAR = placed((0.4, 0.4, 8.0))
 BLOB = placed((0.5, 0.5, 0.5), 0.4, 0.4)
-ERRORS = [
-    "topo_body_count_err", "topo_chi_err", "topo_genus", "topo_mouth_err", "topo_leak_frac",
-    "topo_free_b1_err", "topo_free_b2_err", "topo_bottleneck_h0", "topo_floater_area",
-]  # fmt: skip
-
-
-@pytest.mark.parametrize("id", ERRORS)
-def test_a_good_tube_has_no_error_of_topology(id):
-    assert measure(id, good()).value == pytest.approx(0.0, abs=1e-9)
-
-
-def test_free_space_of_a_good_tube_is_one_piece():
-    assert measure("topo_free_b0", good()).value == 1
 
 
 def test_a_wall_across_cuts_it_in_two():

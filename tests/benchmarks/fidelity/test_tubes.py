@@ -1,6 +1,6 @@
 """Tubes with one dimension wrong: what each metric says of it, by dimension; a copy is right within noise."""
 
-from math import inf
+from math import inf, pi
 
 import numpy as np
 import pytest
@@ -71,7 +71,15 @@ KNOWN = (
         "free3d_false_occupied": below(1e-3), "free3d_hold_poses_free": about(1.0),
         "free3d_voxel_vs_mesh_vol": below(2.0), "nav_path_exists": about(1.0), "nav_path_len_ratio": about(1.0),
         "nav_path_dev_p95": about(0.0), "nav_feasible_agree": about(1.0), "nav_traversable_iou": about(1.0),
-        "nav_blocked_diff": about(0.0)}),
+        "nav_blocked_diff": about(0.0), "nav_clearance_min_err": about(0.0), "nav_clearance_mean_err": about(0.0),
+        "mesh_finite": about(1.0), "mesh_watertight": about(1.0), "mesh_winding_consistent": about(1.0),
+        "mesh_is_volume": about(1.0), "mesh_manifold_status": about(1.0), "mesh_orientation_frac": about(1.0),
+        "mesh_boundary_unexpected": about(0.0), "mesh_nonmanifold_edges": about(0.0),
+        "mesh_duplicate_faces": about(0.0), "mesh_degenerate_faces": about(0.0), "mesh_self_intersections": about(0.0),
+        "topo_body_count_err": about(0.0), "topo_chi_err": about(0.0), "topo_genus": about(0.0),
+        "topo_mouth_err": about(0.0), "topo_leak_frac": about(0.0), "topo_free_b0": about(1.0),
+        "topo_free_b1_err": about(0.0), "topo_free_b2_err": about(0.0), "topo_bottleneck_h0": about(0.0),
+        "topo_bottleneck_h1": about(0.0), "topo_floater_area": about(0.0), "tri_chord_error_max": below(1e-3)}),
     (SHORT, {"width": 5.8}, {
         "free2d_width_mae": about(0.2, 5e-3), "free2d_width_min_err": about(0.2, 5e-3),
         "free2d_area_rel_err": about(100 * 0.2 / 5.6, 1.0), "occ2d_free_precision": below(0.98),
@@ -86,6 +94,8 @@ KNOWN = (
         "trk_sleeper_spacing_err": about(0.06, 1e-3), "trk_sleeper_f1": below(0.7),
         "trk_sleeper_count_rel_err": about(100 * 2 / 20, 0.1)}),
     (SHORT, {"gauge": 1.445}, {"trk_gauge_mean_err": about(10.0, 0.2), "trk_gauge_p95_dev": about(10.0, 0.5)}),
+    (SHORT, {"gauge": SHORT.gauge + 0.2}, {  # rails 10 cm farther out give the way 10 cm more room
+        "nav_clearance_min_err": about(0.1, 0.02), "nav_clearance_mean_err": about(0.1, 0.02)}),
     (SHORT, {"gauge": 1.425}, {"trk_gauge_mean_err": about(10.0, 0.2), "trk_gauge_p95_dev": about(10.0, 0.5)}),
     (SHORT, {"shift": (0.05, 0.03)}, {
         "trk_rail_lateral_rmse": about(0.05, 2e-3), "trk_rail_height_rmse": about(0.03, 4e-3)}),
@@ -107,6 +117,18 @@ KNOWN = (
     (DEFAULT, {"length": 14.0}, {
         "c2m_chainage_worst": above(0.5), "beam_within_10cm": below(0.9), "vox_chainage_min_f1": below(0.9)}),
     (DEFAULT, {"height": 6.6}, {"comp_chainage_min": below(0.9)}),
+    (DEFAULT, {}, {
+        "cl_icp_translation": below(0.03), "sec_height_rmse": below(1e-6), "sec_area_rel_err_mean": below(1e-6),
+        "sec_area_rel_err_p95": below(1e-6), "c2m_p99": below(2.6 * SIGMA), "c2m_within_5cm": above(0.98),
+        "beam_range_p95": about(1.96 * SIGMA, 0.1 * SIGMA), "lin_circ_pitch_err": below(1.0)}),
+    (DEFAULT, {"shift": (0.1, 0.0)}, {"cl_icp_translation": about(0.1, 0.03)}),
+    (DEFAULT, {"height": 6.3}, {"sec_height_rmse": about(0.1, 2e-3)}),
+    (DEFAULT, {"variation": 0.0}, {  # the area is off by twice the variation
+        "sec_area_rel_err_mean": about(100 * 2 * 0.006 * 2 / pi, 0.1), "sec_area_rel_err_p95": about(1.2, 0.1)}),
+    (DEFAULT, {"width": 5.8}, {
+        "c2m_p99": above(0.1), "c2m_within_5cm": below(0.75), "beam_range_p95": above(0.1),
+        "beam_rel_medae": above(0.2)}),
+    (DEFAULT, {"depth": 0.0}, {"lin_circ_pitch_err": about(100.0)}),
     (DEFAULT, {"track": False}, {"deg_alias_diff": above(0.0)}),
 )  # fmt: skip
 
