@@ -23,6 +23,7 @@ from tests.test_extend import FILES, forget
 
 ROOT = Path(__file__).parents[1]
 PAGES = [
+    ROOT / "README.md",
     *sorted((ROOT / "docs" / "guide").glob("*.md")),
     *(ROOT / "docs" / f"{name}.md" for name in ("index", "tasks", "results")),
 ]
@@ -89,7 +90,7 @@ def _run(page: Path, blocks: list[re.Match[str]]) -> None:
 
 
 def _id(page: Path) -> str:
-    return page.relative_to(ROOT / "docs").with_suffix("").as_posix()
+    return page.relative_to(ROOT).with_suffix("").as_posix().removeprefix("docs/")
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if _blocks(page, slow=False)], ids=_id)
@@ -116,9 +117,23 @@ def _lost(text: str) -> list[str]:
 
 def test_files_and_folders_that_the_pages_name_are_there():
     """But for what failed, which names what was there on the day."""
-    for page in {ROOT / "README.md", *(ROOT / "docs").rglob("*.md")} - {ROOT / "docs" / "failed.md"}:
+    for page in {*PAGES, *(ROOT / "docs").rglob("*.md")} - {ROOT / "docs" / "failed.md"}:
         assert not (lost := _lost(page.read_text())), f"{page.relative_to(ROOT)}: {lost}"
     assert _lost("`train/nowhere.py`, `train/ppo.py` and `scene/`") == ["train/nowhere.py"]
+
+
+def test_every_link_and_target_of_the_readme_and_every_room_exists():
+    readme = PAGES[0].read_text()
+    links = re.findall(r"\]\((?!https?:)([^)#]+)", readme)
+    assert len(links) >= 10
+    rooms = re.findall(r"^\| `([\w/]+/)` \|", (ROOT / "docs" / "design.md").read_text(), re.MULTILINE)
+    assert len(rooms) >= 5
+    for path in (*links, *rooms):
+        assert (ROOT / path).exists(), path
+    targets = set(re.findall(r"\bmake ([a-z-]+)(?=[ `])", readme))
+    assert {"demo", "test"} <= targets
+    for target in targets:
+        assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(), re.MULTILINE), target
 
 
 def _stopping(real: Callable[..., Any]) -> Callable[..., Any]:
