@@ -37,7 +37,7 @@ def test_it_begins_anew_with_a_fresh_draw_and_keeps_the_last_observation(env):
     """Under vmap, and with the default params."""
     obs, state = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 3))
     ahead = jnp.tile(jnp.array([1.0, 0.0]), (3, 1))
-    step = lambda key, state: jax.vmap(env.step)(jax.random.split(key, 3), state, ahead)  # noqa: E731
+    step = jax.jit(lambda key, state: jax.vmap(env.step)(jax.random.split(key, 3), state, ahead))
     outs = episode(step, jax.random.key(1), state, 2 * HORIZON)
     done = np.stack([out[3] | out[4] for out in outs])
     np.testing.assert_array_equal(done.T, [[(k + 1) % HORIZON == 0 for k in range(2 * HORIZON)]] * 3)
