@@ -15,9 +15,8 @@ import jax
 import tyro
 
 from subterra_jax.host.command import EXIT_INTERRUPTED, parse, run_command
-from train import clock, devices
+from train import clock
 from train.config import ConfigError, Legs, TrainConfig, check, make_config
-from train.devices import Cluster
 from train.evaluate import check_episodes
 from train.options import insert_file, reward_of, settings_of, with_weights
 from train.session import Session, check_seeds, run_seeds
@@ -61,8 +60,6 @@ class Command:
     legs: Legs = dataclasses.field(default_factory=Legs)  # the trial of `--embodiment b2`
     # further places to log to
     logs: Annotated[Logs, tyro.conf.OmitArgPrefixes] = dataclasses.field(default_factory=Logs)
-    # other processes to train with
-    cluster: Annotated[Cluster, tyro.conf.OmitArgPrefixes] = dataclasses.field(default_factory=Cluster)
     # settings of PPO
     config: Annotated[TrainConfig, tyro.conf.OmitArgPrefixes] = dataclasses.field(default_factory=TrainConfig)
 
@@ -82,11 +79,7 @@ def _read_words(arguments: list[str]) -> Command:
     early.add_argument("--task", default=DEFAULT_TASK)
     early.add_argument("--memory", default="none")
     early.add_argument("--preset")
-    early.add_argument("--coordinator")
-    early.add_argument("--processes", type=int)
-    early.add_argument("--process", type=int)
     named, _ = early.parse_known_args(arguments)
-    devices.join_cluster(Cluster(named.coordinator, named.processes, named.process))
     preset = named.preset or ("cpu" if jax.default_backend() == "cpu" else "gpu")
     task = require_task(named.task)
     config = make_config(task, preset, named.memory)
@@ -115,8 +108,7 @@ def command(arguments: Command) -> int:
     world = with_reward(_world(arguments), reward_of(arguments))
     clock.lap("tunnel")
     status = _several(arguments, world) if arguments.seeds else _one(arguments, world)
-    if devices.leads():
-        print(clock.line(), file=sys.stderr)
+    print(clock.line(), file=sys.stderr)
     return status
 
 
@@ -151,8 +143,6 @@ def _one(arguments: Command, world: World) -> int:
     last = session.train(resume=arguments.resume, overwrite=arguments.overwrite)
     if last is None:
         return EXIT_INTERRUPTED
-    if not devices.leads():
-        return 0
     if arguments.evaluation_episodes:
         session.score(last, arguments.evaluation_episodes)
         clock.lap("evaluate")

@@ -95,7 +95,8 @@ def save_checkpoint(
     place = run / FOLDER / f"{iteration:08d}"
     with replace_folder(place) as fresh:
         # At least one axis each: Orbax gives scalars back as Python numbers.
-        _arrays_file().save((fresh / ARRAYS).resolve(), {k: np.atleast_1d(v) for k, v in arrays.items() if v.size})
+        kept = {name: np.atleast_1d(array) for name, array in arrays.items() if array.size}
+        ocp.PyTreeCheckpointer().save((fresh / ARRAYS).resolve(), kept)
         (fresh / FACTS).write_text(json.dumps(whole, indent=1) + "\n")
         if add is not None:
             add(fresh)
@@ -131,7 +132,7 @@ def load_checkpoint(folder: Path, iteration: int | None = None) -> Stored:
     if found != SCHEMA:
         raise CheckpointError(f"{place / FACTS}: {other_schema(found, SCHEMA, 'train anew with `--overwrite`')}")
     try:
-        restored = _arrays_file().restore((place / ARRAYS).resolve())
+        restored = ocp.PyTreeCheckpointer().restore((place / ARRAYS).resolve())
         whole = {**restored, **{name: np.zeros(0, dtype) for name, dtype in facts["empty"].items()}}
         arrays = {name: np.asarray(whole[name]).reshape(shape) for name, shape in facts["shapes"].items()}
     except Exception as error:  # a truncated file surfaces as whatever the storage library makes of it
@@ -149,15 +150,6 @@ def has_checkpoint(run: Path) -> bool:
 def iterations(run: Path) -> list[int]:
     """Lists the iterations of which a run folder holds checkpoints, in order."""
     return [int(place.name) for place in _numbered(run / FOLDER)]
-
-
-def _arrays_file() -> ocp.Checkpointer:
-    """Orbax for this process alone: of several that train together, others neither write nor wait for it."""
-    me = jax.process_index()
-    alone = ocp.options.MultiprocessingOptions(
-        primary_host=me, active_processes={me}, barrier_sync_key_prefix=f"process{me}"
-    )
-    return ocp.Checkpointer(ocp.PyTreeCheckpointHandler(multiprocessing_options=alone), multiprocessing_options=alone)
 
 
 def _find(folder: Path) -> Path:

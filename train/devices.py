@@ -1,14 +1,12 @@
-"""One run on many devices, or in many processes: parts, compiler options, and processes that train together."""
+"""One run on many devices: parts of its environments, and compiler options."""
 
 import dataclasses
-import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, PRNGKeyArray
 
@@ -84,8 +82,6 @@ class Spread:
         if n_parts < 2:
             raise ConfigError(f"parts must be at least 2 to be spread over devices, got {n_parts}")
         n_devices = max(n for n in range(1, len(found) + 1) if n_parts % n == 0)
-        if jax.process_count() > 1 and n_devices != len(found):
-            raise ConfigError(f"parts = {n_parts} cannot be shared out among the {len(found)} devices of all processes")
         self.mesh = Mesh(np.array(found[:n_devices]), (DEVICE,))
 
     def init(self, key: Any, params: Any) -> Any:
@@ -131,10 +127,8 @@ class Spread:
         )
 
     def gather(self, state: Any) -> Any:
-        """Fetches the whole state to the host; every process must call it."""
-        if jax.process_count() == 1:
-            return jax.device_get(state)
-        return multihost_utils.process_allgather(state, tiled=True)
+        """Fetches the whole state to the host."""
+        return jax.device_get(state)
 
     def _fields(self, of_parts: Any, common: Any) -> Any:
         """Returns a state with one value in place of each of its fields."""
@@ -144,61 +138,3 @@ class Spread:
 
     def _over_devices(self, function: Callable[..., Any], given: Any, made: Any) -> Callable[..., Any]:
         return jax.shard_map(function, mesh=self.mesh, in_specs=given, out_specs=made, check_vma=False)
-
-
-# Where each launcher says how many processes it has started, and jax knows how to find the rest.
-_COUNTS = {"Slurm": "SLURM_STEP_NUM_TASKS", "Open MPI": "OMPI_COMM_WORLD_SIZE"}
-# An indexed job of Kubernetes says which of its pods this is; that it has several, only `--processes` does.
-_POD = "JOB_COMPLETION_INDEX"
-
-
-@dataclasses.dataclass(frozen=True)
-class Cluster:
-    """Processes that train together; by default as the launcher says, or this process alone."""
-
-    coordinator: str | None = None  # address and port of process 0, `host:port`
-    processes: int | None = None  # number of processes
-    process: int | None = None  # number of this process, from 0; in an indexed job of Kubernetes it need not be given
-
-
-def find_launcher(environment: Mapping[str, str]) -> str | None:
-    """Finds the launcher that started several processes, by its environment; None if there is none."""
-    for name, count in _COUNTS.items():
-        if environment.get(count, "1").isdigit() and int(environment.get(count, "1")) > 1:
-            return name
-    return None
-
-
-def resolve_cluster(given: Cluster, environment: Mapping[str, str]) -> Cluster:
-    """Completes the settings by the process that Kubernetes names.
-
-    Raises:
-        ConfigError: Some are given and others are missing or out of range.
-    """
-    if given == Cluster():
-        return given
-    pod = environment.get(_POD)
-    process = given.process if given.process is not None or pod is None else int(pod)
-    if given.coordinator is None or given.processes is None or process is None:
-        raise ConfigError("coordinator, processes and process must be given together")
-    if not 0 <= process < given.processes:
-        raise ConfigError(f"process must lie between 0 and processes - 1 = {given.processes - 1}, got {process}")
-    return dataclasses.replace(given, process=process)
-
-
-def join_cluster(given: Cluster) -> None:
-    """Joins the other processes, if there are any; before anything else is asked of jax.
-
-    Raises:
-        ConfigError: As `resolve_cluster`.
-    """
-    settings = resolve_cluster(given, os.environ)
-    if settings.coordinator is not None:
-        jax.distributed.initialize(settings.coordinator, settings.processes, settings.process)
-    elif find_launcher(os.environ):
-        jax.distributed.initialize()
-
-
-def leads() -> bool:
-    """Returns True for the process that writes the run folder and speaks to the user."""
-    return jax.process_index() == 0

@@ -12,7 +12,6 @@ import jax
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.host.files import replace_file, require_folder
 from subterra_jax.policies.files import CHECKPOINT_POLICY, TENSORS
-from train import devices
 from train.checkpoint import (
     FOLDER,
     CheckpointError,
@@ -75,10 +74,9 @@ class RunFolder:
             self._check_begun()
         elif not overwrite and self._holds_run():
             raise RunFolderError(f"{self.path}: holds a run already; --resume goes on with it, --overwrite replaces it")
-        if devices.leads():
-            if resume:
-                print(f"{self.path}: no checkpoint yet; begins at the beginning", file=sys.stderr)
-            self.start()
+        if resume:
+            print(f"{self.path}: no checkpoint yet; begins at the beginning", file=sys.stderr)
+        self.start()
         return None
 
     def start(self) -> None:
@@ -114,8 +112,7 @@ class RunFolder:
             ),
             solved_for=facts["solved_for"],
         )
-        if devices.leads():
-            self._write_config()
+        self._write_config()
         return snapshot
 
     def _holds_run(self) -> bool:
@@ -161,8 +158,6 @@ class RunFolder:
     def save(self, snapshot: Snapshot) -> None:
         """Writes a checkpoint, from which the policy can be used and the run can go on."""
         score, state = snapshot.best.score, self._learner.gather(snapshot.state)
-        if not devices.leads():
-            return
         driver = self._learner.driver
         tensors = driver.tensors(snapshot.policy)
         facts = {

@@ -15,8 +15,8 @@ from subterra_jax.host.command import complaint_sentence
 from train.config import ConfigError
 
 ENDINGS = (".yaml", ".yml", ".toml", ".json")
-_FLAT = ("config", "cluster", "logs")  # groups whose options stand alone on the command line
-_OF_THIS_RUN = ("out", "settings", "seeds", "resume", "overwrite", "cluster")
+_FLAT = ("config", "logs")  # groups whose options stand alone on the command line
+_OF_THIS_RUN = ("out", "settings", "seeds", "resume", "overwrite")
 C = TypeVar("C")
 
 

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jax.experimental import multihost_utils
 from jaxtyping import Array, Bool, Float, Int
 
 # One step in so many ends an episode, at most, or all of them are fetched.
@@ -104,8 +103,7 @@ def _cut(ended: Ended, shape: tuple[int, ...], finished: Callable[[], Finished])
 
 def _whole(finished: Finished) -> Finished:
     """Fetches finished episodes, with all parts beside each other as one batch of environments."""
-    alone = jax.process_count() == 1
-    arrays = jax.device_get(finished) if alone else multihost_utils.process_allgather(finished, tiled=True)
+    arrays = jax.device_get(finished)
     return jax.tree.map(lambda x: np.moveaxis(x, 0, 1).reshape(x.shape[1], -1) if x.ndim == 3 else x, arrays)
 
 

@@ -6,7 +6,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 from rich.console import Console
 from rich.table import Table
@@ -14,7 +13,7 @@ from rich.table import Table
 from subterra_jax.evaluation.episodes import SHA256
 from subterra_jax.host.command import EXIT_INTERRUPTED
 from subterra_jax.host.files import replace_file
-from train import clock, devices
+from train import clock
 from train.checkpoint import iterations
 from train.config import ConfigError
 from train.curve import GOAL, write_curve
@@ -62,10 +61,9 @@ class Session:
     def open(self, snapshot: Snapshot | None) -> None:
         """Begins to log, after a snapshot or from the beginning."""
         iteration, episodes = (snapshot.iteration, snapshot.window.count) if snapshot else (0, 0)
-        if devices.leads():
-            self.log = RunLog(self.folder.path, iteration, episodes)
-            step = iteration * self.learner.config.steps_per_iteration
-            self._sinks = self._logs.open(self.folder.path, step, dataclasses.asdict(self.learner.config))
+        self.log = RunLog(self.folder.path, iteration, episodes)
+        step = iteration * self.learner.config.steps_per_iteration
+        self._sinks = self._logs.open(self.folder.path, step, dataclasses.asdict(self.learner.config))
 
     def train(self, *, resume: bool, overwrite: bool, label: str = "") -> Snapshot | None:
         """Trains the run to its end, then writes the last checkpoint and the curve.
@@ -79,9 +77,8 @@ class Session:
             The last snapshot; None after Ctrl-C, with the checkpoint saved.
         """
         last = train_sessions([self], [self.folder.begin(resume=resume, overwrite=overwrite)], [label])
-        if devices.leads():
-            write_curve([self.folder.path], self.folder.path / "curve.png")
-            clock.lap("curve")
+        write_curve([self.folder.path], self.folder.path / "curve.png")
+        clock.lap("curve")
         return None if last is None else last[0]
 
     def note(self, now: Snapshot, *, save: bool = False) -> None:
@@ -136,12 +133,10 @@ def train_sessions(
     with deferred_interrupt() as interrupt:
 
         def stop() -> bool:
-            # Processes that train together stop together: at the end.
-            return interrupt.wanted and jax.process_count() == 1
+            return interrupt.wanted
 
         def watch(k: int, now: Snapshot) -> None:
-            if devices.leads():
-                bar.show(now.record, of=labels[k])
+            bar.show(now.record, of=labels[k])
             sessions[k].note(now, save=stop())
 
         try:

@@ -36,14 +36,3 @@ def test_a_world_of_several_tunnels_is_that_of_their_plans(task, sensor):
     digest = hashlib.sha256("\n".join(f"{name} {VERSION}" for name in names).encode()).hexdigest()
     assert world.facts["tunnel_sha256"] == digest
     assert world.facts["tunnel"] == "open:straight:train:2-3"
-
-
-def test_tunnels_of_another_piece_or_lining_are_kept_apart(tmp_path):
-    whole, part, bare = (
-        tunnels.load(["open:straight:train:2"], lining, tmp_path, piece=piece)[0]
-        for lining, piece in ((None, None), (None, (10.0, 90.0)), ("bare", None))
-    )
-    assert len(list(tmp_path.iterdir())) == 3
-    assert float(part.length) < 100.0 < float(whole.length) == float(bare.length)
-    again = tunnels.load(["open:straight:train:2"], None, tmp_path, piece=(10.0, 90.0))[0]
-    assert float(again.length) == float(part.length)
