@@ -58,7 +58,7 @@ class TrainConfig:
     # Learn what only the simulator knows as well: with `gru` the error of the way to go, with `along` the true
     # station. It is a target and never an input.
     auxiliary: bool = False
-    map_cell: float = 0.25  # length of a cell of the filter, m; for `map`
+    map_cell: float = 0.1  # length of a cell of the filter, m; for `map`. At 0.25 it misses the right place
     # policy whose weights are taken where they fit, by name, file or run folder: network, localiser
     begin_from: str | None = None
     n_envs: int = 128  # environments stepped together
@@ -151,7 +151,8 @@ _BY_MEMORY: dict[str, dict[str, Any]] = {
         "drives": 512,
         "drive_steps": 900,
     },
-    "map": {"n_envs": 512},
+    # Every robot weighs thousands of cells a step; what is learnt is when to stop.
+    "map": {"steps": 80_000, "n_envs": 128, "unroll": 32, "minibatches": 4, "learning_rate": 1e-4},
 }
 _COVER = {"stop_coverage": 0.9}
 _GPU_COVER: dict[str, Any] = {"n_envs": 1024, "epochs": 4, "minibatches": 4, "hidden": (64, 64)}

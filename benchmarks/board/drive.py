@@ -55,7 +55,6 @@ class BoardConfig:
     sensor: str = PLANAR  # The LiDAR of agents without a line in the roster, by name.
     load: tuple[Path, ...] = ()  # Python files to run first, with things of one's own.
     memory: float = 8.0  # Memory for driving, GB; an agent that needs more drives in parts.
-    cache: Path | None = None  # Folder in which made tunnels are kept from run to run.
     report_only: bool = False  # Drive nothing.
     cells: Path | None = None  # Cells to report or drive again.
     again: int = 0  # Episodes of each cell to drive once more.
@@ -178,7 +177,7 @@ def drive(config: BoardConfig, missing: list[Job]) -> None:
     names = tunnel_names(columns, config.tunnels)
     for sensor in dict.fromkeys(job.sensor for job in missing):
         started = time.monotonic()
-        made = load(names, cache=config.cache, sensor=sensor)
+        made = load(names, sensor=sensor)
         _progress.print(f"{len(names)} tunnels: {time.monotonic() - started:.0f} s")
         tunnel: Any = made if len(made) > 1 else made[0]
         floors: dict[Setting, list[float] | None] = {}
@@ -240,7 +239,7 @@ def compare(cell: Cell, config: BoardConfig) -> dict[str, Any]:
     drawn = draw_episodes(setting, columns, cell["tunnels"], size, setting.task == "Faulted")
     used = np.unique(drawn.tunnel[rows])  # the tunnels of these episodes alone are made
     names = tunnel_names(columns, cell["tunnels"])
-    made = load([names[i] for i in used], cache=config.cache, sensor=cell["sensor"])
+    made = load([names[i] for i in used], sensor=cell["sensor"])
     env, params = enter(Job(setting, cell["agent"], cell["sensor"]), made if len(made) > 1 else made[0])
     some = {name: values[rows] for name, values in vars(drawn).items()}
     episodes = Episodes(**{**some, "tunnel": np.searchsorted(used, some["tunnel"]).astype(np.int32)})

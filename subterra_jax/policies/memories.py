@@ -53,7 +53,7 @@ class Memory:
 
     kind: str = "none"  # one of `MEMORIES`
     frames: int = 1  # observations in the stack, the newest included; 1 but with `stack`, `along`
-    cell: float = 0.25  # length of a cell of the belief, m; for `map`
+    cell: float = 0.1  # length of a cell of the belief, m; for `map`
 
     @property
     def locates(self) -> bool:
