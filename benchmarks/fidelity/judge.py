@@ -122,11 +122,14 @@ def open_values(case: Case, folder: Path, processes: int = 1) -> Iterator[dict[s
             )
             second.callback(pool.shutdown, cancel_futures=True)  # an interrupt waits for what is under way alone
             theirs = {name: pool.submit(_value_in_second, name) for name in names}
+            pool.shutdown(wait=False)  # it ends, and its memory with it, when these are done
         own = FIRST_HALF if theirs else tuple(table.CATEGORIES)
         for name in names:
             stage = stages[name]
             mine[name] = _value_candidate(case, name, own, lambda id, stage=stage: stage.advance())  # type: ignore[misc]
             keep()
+        case.forget(next(reversed(table.CATEGORIES)))  # what only metrics need makes room for the windows
+        release_memory()
         keep(("base",))
         yield values
         keep(tuple(names))

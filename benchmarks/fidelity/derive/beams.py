@@ -270,6 +270,6 @@ def _describe_scan(reach: Float[np.ndarray, " n"], sector: Int[np.ndarray, " n"]
     return np.concatenate([quantiles, parts])
 
 
-@per_hold
+@kept_until("DEG", per_hold)
 def cloud_tree(case: Case) -> cKDTree:
     return cKDTree(returns(case).points, balanced_tree=False)

@@ -55,7 +55,7 @@ def _principal_axes(
     return middles, spreads, all_axes
 
 
-@per_hold
+@kept_until("DEG", per_hold)
 def plane_rows(case: Case) -> Int[np.ndarray, " k"]:
     """Return the numbers of the returns with a plane: the same count of each scan, evenly in time."""
     scan = returns(case).scan
@@ -71,7 +71,7 @@ def _planes_per_scan(scans: int) -> int:
     return int(np.clip(_MOST_PLANES // scans, 50, _MOST_PER_SCAN))
 
 
-@per_hold
+@kept_until("DEG", per_hold)
 def real_planes(case: Case) -> Planes:
     points = returns(case).points
     return fit_planes(points, cloud_tree(case), points[plane_rows(case)])
@@ -102,7 +102,7 @@ def synthetic_planes(case: Case) -> Planes:
 # Normals of a cloud that is as dense whatever the sensor.
 
 
-@per_hold
+@kept_until("DEG", per_hold)
 def few_rows(case: Case) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " q"]]:
     """Return the numbers of `_FEW_PER_SCAN` returns of each scan, drawn at random, and of those that get a normal."""
     scan = returns(case).scan
@@ -198,7 +198,7 @@ def spatial_consistency(key: Int[np.ndarray, "v 3"], distance: Float[np.ndarray,
     return float(np.mean(ratios))
 
 
-@per_hold
+@kept_until("DEG", per_hold)
 def real_map(case: Case) -> VoxelMap:
     return voxel_map(returns(case).local, MAP_VOXEL)
 

@@ -40,7 +40,7 @@ class CloudDistances:
     station: Float[np.ndarray, " n"]  # Station along the sensor's path, m
 
 
-@per_hold
+@kept_until("DEG", per_hold)
 def thinned_rows(case: Case) -> Int[np.ndarray, " k"]:
     """Return the numbers of at most `MOST_POINTS` returns, evenly spaced in time."""
     count = len(beams.returns(case).range)
@@ -156,7 +156,7 @@ class M3C2Distances:
     station: Float[np.ndarray, " n"]  # Station along the sensor's path, m
 
 
-@per_hold
+@kept_until("DEG", per_hold)
 def _held_epoch(case: Case) -> Any:
     """Return the held-out points about a whole-metre origin, whose tree is built once for all candidates."""
     import py4dgeo
@@ -270,7 +270,7 @@ def occupied_voxels(case: Case) -> Occupied:
     return Occupied(points, known, (np.arange(low[0], high[0]) + 0.5) * edge)
 
 
-@per_hold
+@kept_until("DEG", per_hold)
 def free_voxels(case: Case) -> Int[np.ndarray, "n 3"]:
     """Return the indices of voxels that held-out beams passed in the last metres before their returns."""
     real = beams.returns(case)
