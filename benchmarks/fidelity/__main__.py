@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import tyro
 
@@ -27,7 +27,6 @@ from benchmarks.fidelity.inputs import (
 )
 from benchmarks.fidelity.judge import Judgement
 from benchmarks.fidelity.leaks import find_leaks
-from benchmarks.fidelity.registry import Value
 from benchmarks.fidelity.report import write_report
 from scene.errors import require_input
 from subterra_jax.host.command import parse, run_command
@@ -72,14 +71,12 @@ class SplitCommand:
     rule: SplitConfig = field(default_factory=SplitConfig)  # Rule of the cut.
 
 
-@dataclass(frozen=True)
-class OpenCase:
-    """A case with its inputs, judgement and values."""
+class OpenCase(NamedTuple):
+    """A case with its inputs, and its judgement without controls."""
 
     inputs: Inputs
     case: Case
     judgement: Judgement
-    values: dict[str, dict[str, Value]] = field(default_factory=dict)
 
 
 def load_outside(inputs: Inputs) -> None:
@@ -97,8 +94,7 @@ def open_case(inputs: Inputs, processes: int = 1) -> OpenCase:
     load_outside(inputs)
     resolved = complete_inputs(inputs)
     case = read_case(resolved, processes)
-    judgement = judge.judge_case(case, resolved.out, resolved.strict, processes)
-    return OpenCase(resolved, case, judgement, judgement.values)
+    return OpenCase(resolved, case, judge.judge_case(case, resolved.out, processes))
 
 
 def run(config: RunConfig) -> None:
@@ -119,7 +115,9 @@ def run_controls(config: ControlsConfig) -> None:
     foreign = config.foreign
     if foreign is None and (not config.only or "N33" in config.only):
         foreign = foreign_scene(opened.case, config.out)
-    bench = Bench(opened.case, opened.values["base"], config.out / "controls", foreign, more=opened.inputs.metrics)
+    bench = Bench(
+        opened.case, opened.judgement.values["base"], config.out / "controls", foreign, more=opened.inputs.metrics
+    )
     jobs = [job for job in list_jobs(config.only, foreign is not None) if not config.bold_only or is_bold(job)]
     outcomes = run_jobs(bench, jobs, config.processes)
     rows = judge_outcomes(outcomes, opened.judgement)
@@ -188,9 +186,9 @@ def _write_report(opened: OpenCase) -> dict[str, Any]:
     inputs, folder = opened.inputs, opened.inputs.out
     key = case_hash(opened.case)
     rows = read_kept(folder / "controls.json", CONTROLS_SCHEMA, key).get("rows")
-    leaks = find_leaks(opened.case, opened.values["base"])
-    judgement = judge.make_judgement(opened.values, leaks, rows, inputs.strict, opened.judgement.windows)
-    judgement = judge.add_outside(judgement, opened.case, folder, inputs.strict)
+    leaks = find_leaks(opened.case, opened.judgement.values["base"])
+    judgement = judge.make_judgement(opened.judgement.values, leaks, rows, opened.judgement.windows)
+    judgement = judge.add_outside(judgement, opened.case, folder)
     return write_report(folder, opened.case, inputs, judgement, rows)
 
 

@@ -2,8 +2,6 @@
 
 import json
 import multiprocessing
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
@@ -19,6 +17,7 @@ from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import Writer as Writer2
 
+from benchmarks.command import run_module
 from benchmarks.fidelity.candidate import Candidate, load_candidate
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.derive.curve import Curve
@@ -50,7 +49,6 @@ class Inputs:
     fit_trajectory: Path | None = None  # Its poses; those of `--trajectory` where not given.
     hold: HoldConfig = field(default_factory=HoldConfig)  # Part of a recording to score.
     seed: int = 0  # Seed of sampling, noise and bootstrap.
-    strict: bool = False  # Count metrics without a reference as 0.
     partial: bool = False  # Judge only the part that the recording shows.
     metrics: Path | None = None  # Python file with metrics and faults of your own, see docs/guide/extend.md.
     out: Path = Path("out/fidelity")  # Folder for all results.
@@ -128,11 +126,11 @@ def packaged_inputs(inputs: Inputs) -> Inputs:
     survey, scene = Path("build/survey-351"), Path("build") / PACKAGED
     fitted, held = survey / "survey.bag", survey / f"survey_{HELD_OUT}.bag"
     if not fitted.exists() or not held.exists():
-        run_module("scene.survey", "--truth", "metro", "--length", PACKAGED_LENGTH, "--seed", 0,
+        make("scene.survey", "--truth", "metro", "--length", PACKAGED_LENGTH, "--seed", 0,
              "--sensors", "avia", HELD_OUT, "--scan-every", 10, "--out", survey)  # fmt: skip
     if not is_built_from(scene, fitted):
         given = ("--trajectory", survey / "groundtruth.tum", "--provenance", "simulated", "--name", PACKAGED)
-        run_module("scene.build", fitted, *given, "--out", scene)
+        make("scene.build", fitted, *given, "--out", scene)
     return replace(
         inputs, scene=scene, recording=held, trajectory=survey / f"groundtruth_{HELD_OUT}.tum",
         truth=survey, fit_recording=fitted, fit_trajectory=survey / "groundtruth.tum",
@@ -152,22 +150,16 @@ def foreign_scene(case: Case, folder: Path) -> Path:
     scene = folder / FOREIGN
     if not (scene / "manifest.json").exists():
         survey = folder / "foreign-survey"
-        run_module("scene.survey", "--length", round(case.candidate.length), "--seed", FOREIGN_SEED, "--out", survey)
+        make("scene.survey", "--length", round(case.candidate.length), "--seed", FOREIGN_SEED, "--out", survey)
         given = ("--trajectory", survey / "groundtruth.tum", "--provenance", "simulated")
-        run_module("scene.build", survey / "survey.bag", *given, "--out", scene)
+        make("scene.build", survey / "survey.bag", *given, "--out", scene)
     return scene
 
 
-def run_module(*words: object) -> None:
-    """Runs `python -m ...` as a user would.
-
-    Raises:
-        SubterraError: It failed.
-    """
-    command = [str(word) for word in words]
-    print(f"$ python -m {' '.join(command)}", flush=True)
-    if subprocess.run([sys.executable, "-m", *command]).returncode:
-        raise SubterraError(f"python -m {' '.join(command)} failed")
+def make(module: str, *words: object) -> None:
+    """Runs `python -m MODULE WORDS` as a user would; raises `SubterraError` where it fails."""
+    if run_module(module, *words).status:
+        raise SubterraError(f"python -m {' '.join(map(str, (module, *words)))} failed")
 
 
 # The cut of a recording into fit, val and hold, by blocks of time.

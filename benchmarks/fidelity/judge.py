@@ -55,11 +55,11 @@ class Judgement:
         return "FAIL" if self.reasons else "PASS"
 
 
-def judge_case(case: Case, folder: Path, strict: bool = False, processes: int = 1) -> Judgement:
+def judge_case(case: Case, folder: Path, processes: int = 1) -> Judgement:
     """Computes values, windows, leaks and the verdict without the controls of `controls`."""
     with open_values(case, folder, processes) as values:
         leaks, windows = find_leaks(case, values["base"]), compute_windows(case, folder)
-    return make_judgement(values, leaks, None, strict, windows)
+    return make_judgement(values, leaks, None, windows)
 
 
 def compute_windows(case: Case, folder: Path) -> Windows:
@@ -190,11 +190,10 @@ def make_judgement(
     values: dict[str, Values],
     leaks: list[str],
     controls: list[dict[str, Any]] | None = None,
-    strict: bool = False,
     windows: Windows | None = None,
 ) -> Judgement:
     """Return the verdict over values, leaks, windows and, where they were run, controls."""
-    scored = {name: scoring.score_all(entry, strict=strict) for name, entry in values.items()}
+    scored = {name: scoring.score_all(entry) for name, entry in values.items()}
     skill = median_skill(values["base"], values)
     rows = controls or []
     reasons = scoring.reasons_against(scored["base"], scored["null"], skill, undetected(rows), loud(rows), leaks)
@@ -202,12 +201,11 @@ def make_judgement(
     return Judgement(values, scored, skill, leaks, found.reasons() + reasons, windows=found)
 
 
-def add_outside(judgement: Judgement, case: Case, folder: Path, strict: bool = False) -> Judgement:
+def add_outside(judgement: Judgement, case: Case, folder: Path) -> Judgement:
     """Return the judgement with the metrics from outside computed and scored; its verdict stays the suite's."""
     more = outside.compute_values(case, make_candidates(case), folder)
     scored = {
-        name: scoring.score_all(judgement.values[name] | values, strict=strict, rows=table.load_all())
-        for name, values in more.items()
+        name: scoring.score_all(judgement.values[name] | values, table.load_all()) for name, values in more.items()
     }
     return replace(judgement, outside=scored)
 

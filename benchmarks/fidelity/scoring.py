@@ -59,19 +59,17 @@ def score_one(metric: Metric, value: Value) -> Score:
     return Score(metric, value, metric.map.score(value.value))
 
 
-def score_all(values: Values, strict: bool = False, rows: dict[str, Metric] | None = None) -> Scored:
+def score_all(values: Values, rows: dict[str, Metric] | None = None) -> Scored:
     """Scores every metric and every category.
 
     Args:
         values: Raw values of all rows by id.
-        strict: Count missing values as 0.
         rows: Rows in place of the table's, with metrics from outside.
     """
     rows = rows or table.load()
     scores = {id: score_one(rows[id], values[id]) for id in rows}
     categories = {
-        name: _category_score([s for s in scores.values() if s.metric.category == name], strict)
-        for name in table.CATEGORIES
+        name: _category_score([s for s in scores.values() if s.metric.category == name]) for name in table.CATEGORIES
     }
     gates = tuple(
         id for id, s in scores.items() if s.metric.role == "G" and s.score is not None and s.score < GATE_FLOOR
@@ -83,10 +81,10 @@ def score_all(values: Values, strict: bool = False, rows: dict[str, Metric] | No
     return Scored(scores, categories, gates, overall, saturated)
 
 
-def _category_score(scores: list[Score], strict: bool) -> float | None:
+def _category_score(scores: list[Score]) -> float | None:
     """Return the mean of the scored metrics, capped where a gate fails; `None` where over 30 % of them are missing."""
     scored = [s for s in scores if s.metric.scored]
-    known = scored if strict else [s for s in scored if s.score is not None]
+    known = [s for s in scored if s.score is not None]
     if len(known) < len(scored) * (1.0 - MOST_MISSING):
         return None
     mean = float(np.mean([s.score or 0.0 for s in known]))

@@ -87,7 +87,6 @@ def report_content(
         "worst_category": {"category": worst[1], "score": worst[0]},
         "failed_gates": list(scored.failed_gates),
         "saturated_frac": scored.saturated,
-        "strict": inputs.strict,
         "leaks": judgement.leaks,
         "windows": dump_windows(judgement.windows),
         "split": _split_entry(case, inputs),

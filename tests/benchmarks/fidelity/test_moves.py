@@ -20,7 +20,7 @@ from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.faults import Fault, Site, fault_kind, put_in
 from benchmarks.fidelity.faults.kinds import load_controls, local_site
 from benchmarks.fidelity.faults.mesh import change_both, copy_scene
-from benchmarks.fidelity.inputs import Inputs, complete_inputs, read_case, run_module
+from benchmarks.fidelity.inputs import Inputs, complete_inputs, make, read_case
 from benchmarks.fidelity.meshes import keep_bodies, without_faces
 from tests.benchmarks.fidelity.judged import measure
 
@@ -229,9 +229,9 @@ def test_on_a_survey_made_anew_every_fault_moves_its_metrics(tmp_path: Path) -> 
 def make_case(folder: Path) -> Case:
     """Simulates a 36 m survey, builds its scene from the Avia, and judges it by the OS1."""
     survey, scene = folder / "survey", folder / "scene"
-    run_module("scene.survey", "--truth", "metro", "--length", 36, "--seed", SEED, "--tolerances",
+    make("scene.survey", "--truth", "metro", "--length", 36, "--seed", SEED, "--tolerances",
                "--sensors", "avia", "os1", "--scan-every", 6, "--out", survey)  # fmt: skip
-    run_module("scene.build", survey / "survey.bag", "--trajectory", survey / "groundtruth.tum",
+    make("scene.build", survey / "survey.bag", "--trajectory", survey / "groundtruth.tum",
                "--provenance", "simulated", "--out", scene)  # fmt: skip
     return read_case(complete_inputs(Inputs(
         scene=scene, recording=survey / "survey_os1.bag", trajectory=survey / "groundtruth_os1.tum", truth=survey,
