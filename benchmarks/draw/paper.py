@@ -5,9 +5,7 @@ survey, scene and runs as well.
 """
 
 import json
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -16,19 +14,17 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from scipy.ndimage import minimum_filter1d
 
 from benchmarks.command import BenchmarkError, run_main
-from benchmarks.draw.scene import Picture, Pose, picture
+from benchmarks.draw.scene import Pose, picture
 from benchmarks.fidelity.candidate import load_candidate
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.derive.surface import surface_caster
 from benchmarks.fidelity.references import HoldConfig, load_hold
 from benchmarks.fidelity.report.figures import Sheet, draw_mismatch, draw_projections
 from benchmarks.results import write_file
-from scene.poses.trajectory import Trajectory, load_tum
+from scene.poses.trajectory import load_tum
 from scene.reading.recording import Recording
-from scene.reading.times import Scan
 from subterra_jax.host.files import replace_file, require_folder
 from train.curve import write_curve
 
@@ -42,11 +38,10 @@ _STYLE: dict[Any, Any] = {
     "xtick.labelsize": 7.0, "ytick.labelsize": 7.0, "axes.linewidth": 0.6,
     "pdf.fonttype": 42,  # TrueType: text stays text, and publishers take it
 }  # fmt: skip
-_FRAME_SHARE, _FRAME_RADIUS = 0.3, 8.0  # of the bore's length where the frame is taken; m around it
+_FRAME_SHARE = 0.3  # of the bore's length where the frame is taken
 _DURATION = 1.5  # s of a frame: enough for the Avia's pattern to close most of its gaps
 _FOV = np.deg2rad(58.0)  # at 4:3 inside the Avia's 70 by 77 degrees
-_NEAREST, _RETURN = 0.3, 0.016  # m; nearer returns are not drawn; radius of a drawn one, never less than a pixel
-_LARGEST = 9  # pixels across a drawn return, at most
+_NEAREST = 0.3  # m; nearer returns are not drawn
 
 
 @dataclass(frozen=True)
@@ -60,136 +55,61 @@ class PaperConfig:
 
 
 @dataclass(frozen=True)
-class Stretch:
-    """A piece of the bore where a frame may be taken."""
-
-    position: Float[np.ndarray, "3"]  # Its middle in the tunnel frame, m
-    axis: Float[np.ndarray, "3"]  # Unit vector along the bore
-    radius: float  # Largest distance of a frame from `position`, m
-
-
-@dataclass(frozen=True)
 class Frame:
-    """Returns of a short time, in the tunnel frame."""
+    """Returns of `_DURATION`, in the tunnel frame."""
 
-    position: Float[np.ndarray, "3"]  # LiDAR position in the middle of that time, m
     origin: Float[np.ndarray, "n 3"]  # LiDAR position at each return, m
     points: Float[np.ndarray, "n 3"]  # Returns, m
     topic: str  # Topic of the recording
-    duration: float  # Length of the frame, s
 
 
 def load_frame(
-    recording: Path, trajectory: Path, origin: Float[np.ndarray, "3"], stretch: Stretch, duration: float
+    recording: Path, trajectory: Path, origin: Float[np.ndarray, "3"], place: Float[np.ndarray, "3"]
 ) -> Frame:
-    """Reads the frame that was taken in a stretch of the bore when the LiDAR looked along it.
+    """Reads the frame about the moment at which the LiDAR was nearest to a place.
 
     Args:
         recording: A recording that `scene` can read.
         trajectory: Poses of its LiDAR, TUM file.
         origin: Origin of the tunnel frame in the trajectory's frame, m.
-        stretch: Piece of the bore.
-        duration: Length of the frame, s.
+        place: Place in the tunnel frame, m.
 
     Raises:
         BenchmarkError: No scan lies within that time.
         RecordingError: The recording or the trajectory cannot be read.
     """
     poses = load_tum(trajectory)
-    taken: list[Scan] = []
-    with Recording(recording) as opened:
-        middle = _best_time(poses, origin, stretch, next(opened.scans()), duration)
-        for scan in opened.scans():
-            if scan.stamp > middle + 0.5 * duration:
-                break
-            if scan.stamp >= middle - 0.5 * duration and len(scan.times):
-                taken.append(scan)
-        topic = opened.topic
-    if not taken:
-        raise BenchmarkError(
-            f"{recording}: no scan within {duration:g} s of {middle:.3f} s, when {trajectory} is there"
-        )
+    middle = float(poses.times[np.argmin(np.linalg.norm(poses.positions - origin - place, axis=1))])
     sensor, points = [], []
-    for scan in taken:
-        position, rotation = poses.at(scan.stamp + scan.times)
-        sensor.append(position - origin)
-        points.append(position - origin + rotation.apply(scan.points))
-    here = poses.at(np.array([middle]))[0][0] - origin
-    return Frame(here, np.concatenate(sensor), np.concatenate(points), topic, duration)
-
-
-def _best_time(
-    poses: Trajectory, origin: Float[np.ndarray, "3"], stretch: Stretch, first: Scan, duration: float
-) -> float:
-    """Returns when the LiDAR, inside the stretch, looked most nearly along the axis, either way, s.
-
-    The mean of its beams is its viewing direction. For a sensor that sees all round it is short, and any time will do.
-    """
-    gaze = (first.points / np.maximum(np.linalg.norm(first.points, axis=1), 1e-9)[:, None]).mean(axis=0)
-    along = np.abs(poses.rotations.apply(gaze) @ stretch.axis)
-    width = max(1, round(duration / float(np.median(np.diff(poses.times)))))
-    held = minimum_filter1d(along, width, mode="constant")  # over the whole frame, not for a moment
-    away = np.linalg.norm(poses.positions - origin - stretch.position, axis=1)
-    near = np.flatnonzero(away <= max(stretch.radius, away.min()))
-    return float(poses.times[near[np.argmax(held[near])]])
-
-
-@dataclass(frozen=True)
-class Material:
-    """A survey and the scene built from its Avia, with the OS1 held out; each part is read on first use."""
-
-    survey: Path
-    scene: Path
-
-    @cached_property
-    def manifest(self) -> dict[str, Any]:
-        """Manifest of the scene."""
-        return dict(json.loads((self.scene / "manifest.json").read_text()))
-
-    @cached_property
-    def case(self) -> Case:
-        """Scene with the held-out OS1."""
-        candidate, (bag, poses) = load_candidate(self.scene), (self.survey / name for name in SURVEY_FILES[2:])
-        return Case(candidate, load_hold(bag, poses, candidate.origin, HoldConfig(scan_spacing=0.5, sigma=0.03)))
-
-    @cached_property
-    def row(self) -> int:
-        """Index of the bore's section where the frame is taken."""
-        return round(_FRAME_SHARE * (len(self.case.candidate.bore.station) - 1))
-
-    @cached_property
-    def frame(self) -> Frame:
-        """Frame of the recording that the builder read."""
-        bore = self.case.candidate.bore
-        stretch = Stretch(bore.position[self.row], bore.tangent[self.row], _FRAME_RADIUS)
-        recording, poses = (self.survey / name for name in SURVEY_FILES[:2])
-        return load_frame(recording, poses, self.case.candidate.origin, stretch, _DURATION)
-
-    @cached_property
-    def pose(self) -> Pose:
-        """Camera at the LiDAR, looking along the bore in the LiDAR's direction."""
-        frame, bore = self.frame, self.case.candidate.bore
-        tangent = bore.tangent[np.argmin(np.linalg.norm(bore.position - frame.position, axis=1))]
-        ahead = tangent * np.sign(((frame.points - frame.origin) @ tangent).mean() or 1.0)
-        return Pose(frame.position, ahead, float(_FOV), 1400, 1050)
-
-    @cached_property
-    def view(self) -> Picture:
-        """Scene rendered by MuJoCo from that pose."""
-        return picture(self.scene, self.pose)
+    with Recording(recording) as opened:
+        for scan in opened.scans():
+            if abs(scan.stamp - middle) <= 0.5 * _DURATION and len(scan.times):
+                position, rotation = poses.at(scan.stamp + scan.times)
+                sensor.append(position - origin)
+                points.append(position - origin + rotation.apply(scan.points))
+        topic = opened.topic
+    if not points:
+        raise BenchmarkError(f"{recording}: no scan within {_DURATION:g} s of {middle:.3f} s, of {trajectory}")
+    return Frame(np.concatenate(sensor), np.concatenate(points), topic)
 
 
 Drawn = tuple[Figure, str]
 
 
-def draw_bore_view(material: Material) -> Drawn:
-    """Draws figure 1: recorded returns by depth on the left, MuJoCo's picture on the right."""
-    frame = material.frame
+def draw_bore_view(case: Case, frame: Frame) -> Drawn:
+    """Draws figure 1: recorded returns by depth on the left, MuJoCo's picture from the same pose on the right."""
+    beam, bore = frame.points - frame.origin, case.candidate.bore
+    here = frame.origin[len(frame.origin) // 2]
+    tangent = bore.tangent[np.argmin(np.linalg.norm(bore.position - here, axis=1))]
+    pose = Pose(here, tangent * np.sign((beam @ tangent).mean() or 1.0), float(_FOV), 1400, 1050)
     figure, (left, right) = plt.subplots(1, 2, figsize=(_PAGE, 2.72), layout="constrained")
-    depth = depth_image(material.pose, in_camera(material.pose, frame.points))
-    shown = left.imshow(depth, cmap="viridis_r", norm=LogNorm(2.0, 40.0), interpolation="nearest")
-    left.set_title(f"(a) recording, {frame.duration:g} s of {frame.topic}")
-    right.imshow(material.view)
+    across, down, depth = in_picture(pose, frame.points)
+    far = np.argsort(-depth)  # the nearer return is drawn last
+    shown = left.scatter(across[far], down[far], c=depth[far], s=np.clip(4.0 / depth[far], 0.05, 2.0), lw=0.0,
+                         cmap="viridis_r", norm=LogNorm(2.0, 40.0), rasterized=True)  # fmt: skip
+    left.set(xlim=(0, pose.width), ylim=(pose.height, 0), aspect="equal")
+    left.set_title(f"(a) recording, {_DURATION:g} s of {frame.topic}")
+    right.imshow(picture(case.candidate.folder, pose))
     right.set_title("(b) reconstructed bore in MuJoCo, same pose")
     for axes in (left, right):
         axes.set(xticks=[], yticks=[])
@@ -197,54 +117,39 @@ def draw_bore_view(material: Material) -> Drawn:
     bar.set_label("depth, m")
     bar.ax.minorticks_off()
     bar.ax.set_yticklabels(("2", "5", "10", "20", "40"))
-    beam = frame.points - frame.origin
     reach = np.linalg.norm(beam, axis=1)
-    cast, _ = surface_caster(material.case).first(frame.origin, beam / np.maximum(reach, 1e-9)[:, None])
+    cast, _ = surface_caster(case).first(frame.origin, beam / np.maximum(reach, 1e-9)[:, None])
     error = np.abs(cast - reach)[np.isfinite(cast)]
     return figure, (
-        f"{frame.duration:g} s of the recording, coloured by depth (a), and the MuJoCo scene from the same pose (b). "
+        f"{_DURATION:g} s of the recording, coloured by depth (a), and the MuJoCo scene from the same pose (b). "
         f"Along the recorded beams the scene is {100 * np.median(error):.1f} cm from the returns (median; "
         f"{100 * np.mean(error < 0.10):.1f} % within 10 cm)."
     )
 
 
-def depth_image(pose: Pose, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "height width"]:
-    """Returns the depth of the nearest return in each pixel, m; NaN where there is none.
-
-    Args:
-        pose: Camera.
-        points: Returns to the right, up and ahead of it, m; each is drawn at its size for its distance.
-    """
-    image = np.full((pose.height, pose.width), np.inf)
-    column = np.round(0.5 * pose.width + pose.focal * points[:, 0] / points[:, 2]).astype(int)
-    row = np.round(0.5 * pose.height - pose.focal * points[:, 1] / points[:, 2]).astype(int)
-    reach = np.clip(pose.focal * _RETURN / points[:, 2], 1, _LARGEST // 2).astype(int)
-    for down in range(-(_LARGEST // 2), _LARGEST // 2 + 1):
-        for across in range(-(_LARGEST // 2), _LARGEST // 2 + 1):
-            covers = reach >= max(abs(down), abs(across))
-            y, x = row[covers] + down, column[covers] + across
-            inside = (y >= 0) & (y < pose.height) & (x >= 0) & (x < pose.width)
-            np.minimum.at(image, (y[inside], x[inside]), points[covers][inside, 2])
-    return np.where(np.isfinite(image), image, np.nan)
-
-
-def in_camera(pose: Pose, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "k 3"]:
-    """Returns the points inside a camera's picture: right, up and ahead of it, m."""
+def in_picture(pose: Pose, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3 k"]:
+    """Returns pixels across and down, and depth in m, of the points that a camera has in its picture."""
     local = (points - pose.position) @ pose.axes.T
-    local = local[local[:, 2] > _NEAREST]
-    half = 0.5 * np.array([pose.width, pose.height]) / pose.focal
-    return local[(np.abs(local[:, :2] / local[:, 2:]) <= half).all(axis=1)]
+    right, up, depth = local[local[:, 2] > _NEAREST].T
+    across = 0.5 * pose.width + pose.focal * right / depth
+    down = 0.5 * pose.height - pose.focal * up / depth
+    inside = (np.abs(across / pose.width - 0.5) <= 0.5) & (np.abs(down / pose.height - 0.5) <= 0.5)
+    return np.stack([across, down, depth])[:, inside]
 
 
-def _drawings(material: Material) -> dict[str, Callable[[], Drawn | None]]:
-    """Returns what draws figures 1 and 3 by name; the third is that of a fidelity report."""
-    report = {"seed": 0, "split": {"hold": {"file": SURVEY_FILES[2]}, "rule": "by sensor"}}
-    sheet = Sheet(material.case, report)
+def draw_figures(survey: Path, scene: Path) -> dict[str, Drawn | None]:
+    """Draws figures 1 and 3 of a survey and the scene built from its Avia, with the OS1 held out.
+
+    The third is that of a fidelity report.
+    """
+    candidate, (fitted, fit_poses, held, poses) = load_candidate(scene), (survey / name for name in SURVEY_FILES)
+    case = Case(candidate, load_hold(held, poses, candidate.origin, HoldConfig(scan_spacing=0.5, sigma=0.03)))
+    row = round(_FRAME_SHARE * (len(candidate.bore.station) - 1))
+    frame = load_frame(fitted, fit_poses, candidate.origin, candidate.bore.position[row])
+    sheet = Sheet(case, {"seed": 0, "split": {"hold": {"file": held.name}, "rule": "by sensor"}})
     return {
-        "fig1": lambda: draw_bore_view(material),
-        "fig3a": lambda: draw_projections(sheet),
-        "fig3b": lambda: draw_mismatch(sheet),
-    }
+        "fig1": draw_bore_view(case, frame), "fig3a": draw_projections(sheet), "fig3b": draw_mismatch(sheet),
+    }  # fmt: skip
 
 
 def run(config: PaperConfig) -> None:
@@ -265,11 +170,11 @@ def run(config: PaperConfig) -> None:
     require_folder(config.out)
     captions = {}
     if config.survey is not None and config.scene is not None:
-        material = Material(config.survey, config.scene)
-        provenance = f"Survey {config.survey.name}, {material.manifest.get('input_provenance')}."
+        manifest = json.loads((config.scene / "manifest.json").read_text())
+        provenance = f"Survey {config.survey.name}, {manifest.get('input_provenance')}."
         with plt.rc_context(_STYLE):
-            for name, draw in _drawings(material).items():
-                if (drawn := draw()) is not None:
+            for name, drawn in draw_figures(config.survey, config.scene).items():
+                if drawn is not None:
                     captions[name] = f"{drawn[1]} {provenance}"
                     _save(drawn[0], config.out / name)
         write_file(config.out / "figures.json", (json.dumps(captions, indent=1) + "\n").encode())

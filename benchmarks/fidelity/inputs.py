@@ -256,7 +256,6 @@ def _file_record(path: Path) -> dict[str, str]:
 
 
 def _add_channel(writer: Any, connection: Any) -> Any:
-    """Adds the recording's channel with its own message definition."""
     digest = {"md5sum" if isinstance(writer, Writer1) else "rihs01": connection.digest}
     return writer.add_connection(connection.topic, connection.msgtype, msgdef=connection.msgdef.data, **digest)
 

@@ -98,7 +98,6 @@ def open_values(case: Case, folder: Path, processes: int = 1) -> Iterator[dict[s
     theirs: dict[str, Future[Values]] = {}
 
     def keep(wait: tuple[str, ...] = ()) -> None:
-        """Keeps what both processes are through with, in order."""
         for name in names:
             if name in values:
                 continue
@@ -225,7 +224,6 @@ def median_skill(values: Values, base: dict[str, Values]) -> float | None:
 
 
 def _signed_error(metric: Metric, value: float | None) -> float | None:
-    """Return a value turned so that less is better."""
     if value is None:
         return None
     if metric.map.kind == "B":

@@ -40,7 +40,6 @@ def duplicate_share(hold: Hold, fit: Hold) -> float:
 
 
 def noise_leaks(case: Case, values: dict[str, Value]) -> list[str]:
-    """Return the findings against a recording without noise of its own."""
     hold = case.hold
     assert hold is not None
     sigma = plane_noise(hold, case.rng("leaks"))

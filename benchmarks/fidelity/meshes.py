@@ -49,7 +49,6 @@ def find_bodies(mesh: trimesh.Trimesh) -> tuple[Int[np.ndarray, " v"], Float[np.
 def keep_bodies(
     mesh: trimesh.Trimesh, keep: Callable[[Float[np.ndarray, "b 3"]], Bool[np.ndarray, " b"]]
 ) -> trimesh.Trimesh:
-    """Keeps the bodies whose middle passes a test."""
     if not len(mesh.faces):
         return mesh
     label, middle = find_bodies(mesh)
@@ -59,7 +58,6 @@ def keep_bodies(
 def move_bodies(
     mesh: trimesh.Trimesh, shift: Callable[[Float[np.ndarray, "b 3"]], Float[np.ndarray, "b 3"]]
 ) -> trimesh.Trimesh:
-    """Moves each body by the shift of its middle."""
     if not len(mesh.faces):
         return mesh
     label, middle = find_bodies(mesh)

@@ -177,7 +177,6 @@ def load() -> dict[str, Metric]:
 
 
 def load_all() -> dict[str, Metric]:
-    """Return the metrics of the suite, then those from outside, by id."""
     suite = load()
     return suite | _numbered({id: row for id, row in _METRICS.items() if id not in suite}, len(suite))
 

@@ -157,7 +157,6 @@ def axis_pair(case: Case) -> AxisPair:
 
 
 def chord_heading(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " m"]:
-    """Return the heading of the chords over 2 m, rad."""
     chord = points[2:] - points[:-2]
     return np.arctan2(chord[:, 1], chord[:, 0])
 

@@ -151,7 +151,6 @@ def synthetic_points(case: Case) -> Float[np.ndarray, "n 3"]:
 
 
 def side_points(case: Case, real: bool) -> Float[np.ndarray, "n 3"]:
-    """Return the held-out points or, in the same order, the synthetic ones, m."""
     return returns(case).points if real else synthetic_points(case)
 
 

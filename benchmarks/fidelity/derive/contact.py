@@ -150,13 +150,11 @@ class Stepper:
     data: mjx.Data  # MJX data of the model's first pose
 
     def at(self, qpos: np.ndarray, qvel: np.ndarray) -> mjx.Data:
-        """Return the MJX data of a state."""
         return self.data.replace(qpos=jax.numpy.asarray(qpos), qvel=jax.numpy.asarray(qvel))
 
 
 @kept_until("PAR", per_case)
 def stepper(case: Case) -> Stepper:
-    """Puts the scene on the device and compiles a step."""
     model = scene.scene_model(case)
     device = mjx.put_model(model)
     data = mjx.make_data(device)

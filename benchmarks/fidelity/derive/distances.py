@@ -282,7 +282,6 @@ def free_voxels(case: Case) -> Int[np.ndarray, "n 3"]:
 
 
 def dilate(grid: Bool[np.ndarray, "..."], by: int = 1) -> Bool[np.ndarray, "..."]:
-    """Grows a grid by whole voxels in every direction."""
     return ndimage.maximum_filter(grid.astype(np.uint8), 2 * by + 1, mode="constant").astype(bool)
 
 

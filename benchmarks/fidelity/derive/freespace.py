@@ -51,7 +51,6 @@ def carve_beams(case: Case) -> Carved:
 
 @kept_until("F3D", per_hold)
 def carved_about(case: Case, curve: Curve) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "b 3"]]:
-    """Return passed and ended points as station, left and up about a curve, m."""
     samples = carve_beams(case)
     return curve.local(samples.passed), curve.local(samples.ended)
 
@@ -143,7 +142,6 @@ def object_points(case: Case, edge: float) -> Float[np.ndarray, "k 3"]:
 
 
 def track_points(case: Case, edge: float) -> Float[np.ndarray, "k 3"]:
-    """Return samples of the candidate's track, m."""
     track = case.candidate.track
     parts = [track.sleeper_mesh, track.rail_mesh, track.fastening_mesh]
     return sample_surface(concatenate_meshes([part for part in parts if len(part.faces)]), edge / 2)[0]

@@ -52,7 +52,6 @@ class Ground:
 
     @property
     def width(self) -> Float[np.ndarray, " n"]:
-        """Traversable width by row, m."""
         return self.traversable.sum(axis=1) * self.spacing
 
     @property
@@ -84,7 +83,6 @@ def ground_curve(case: Case) -> Curve:
 
 
 def ground_axes(curve: Curve, cell: float) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " m"]]:
-    """Return stations of the rows and offsets to the left of the columns, m."""
     station = curve.station[0] + MOUTH_MARGIN + cell * (np.arange(int((curve.length - 2 * MOUTH_MARGIN) / cell)) + 0.5)
     columns = LATTICES * int(GROUND_HALF / cell)
     return station, cell / LATTICES * np.arange(-columns, columns + 1)
@@ -343,7 +341,6 @@ def feasible_trips(ground: Ground, triples: Int[np.ndarray, "t 3"]) -> Bool[np.n
 
 
 def draw_trips(ground: Ground, rng: np.random.Generator) -> Int[np.ndarray, "t 3"]:
-    """Draws random start, goal and inflation on traversable ground."""
     places = np.flatnonzero(ground.traversable)
     if not len(places):
         raise ValueError("the reference has no traversable ground")

@@ -93,7 +93,6 @@ def _hold_map(case: Case, curve: curves.Curve) -> Unrolled:
 
 
 def map_of_points(curve: curves.Curve, local: Float[np.ndarray, "k 3"]) -> Unrolled:
-    """Return a map from points given as station, left and up."""
     rows = max(int(curve.length / ROW), 2)
     step = curve.length / rows
     row = (local[:, 0] - curve.station[0]) / step
@@ -235,7 +234,6 @@ def pocket_rows(unrolled: Unrolled, arc: Float[np.ndarray, " m"]) -> Float[np.nd
 
 
 def _fourier(signal: np.ndarray, station: np.ndarray, frequency: np.ndarray) -> np.ndarray:
-    """Return the Fourier integral of a signal at frequencies in 1/m."""
     parts = np.array_split(frequency, max(len(frequency) // 100, 1))
     return np.concatenate([np.exp(-2j * np.pi * part[:, None] * station) @ signal for part in parts])
 

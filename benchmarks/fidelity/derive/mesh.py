@@ -164,7 +164,6 @@ class Grid:
         return cells
 
     def on_curve(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the cells along the curve itself."""
         middle = np.floor((0.0 - self.low[1:]) / self.cell[1:]).astype(int)
         along = np.arange(self.shape[0])
         return along, np.full_like(along, middle[0]), np.full_like(along, middle[1])
@@ -180,7 +179,6 @@ class Grid:
 
 
 def _make_grid(case: Case, curve: Curve, points: Float[np.ndarray, "k 3"]) -> Grid:
-    """Return a grid that holds the points between the ends of a curve."""
     cell = np.asarray(_GRID_CELL)
     across = np.abs(curve.local(points[::10])[:, 1:])
     half = np.percentile(across, 99.9, axis=0) + _GRID_PAD
@@ -191,7 +189,6 @@ def _make_grid(case: Case, curve: Curve, points: Float[np.ndarray, "k 3"]) -> Gr
 
 @kept_until("TOP", per_case)
 def surface_samples(case: Case) -> Float[np.ndarray, "k 3"]:
-    """Return points all over the candidate's visible surface, m."""
     return sample_surface(visible_surface(case), _SAMPLE_SPACING)[0]
 
 

@@ -40,7 +40,6 @@ class LidarPoses:
 
 
 def make_environment(case: Case) -> tuple[st.TunnelEnv, EnvParams]:
-    """Makes the task on the candidate's own tunnel, read afresh."""
     return st.make(TASK, tunnel=case.candidate.tunnel, lining=PLAN_LINING)
 
 
@@ -149,7 +148,6 @@ def _observe_episode(case: Case, actions: np.ndarray) -> np.ndarray:
 
 @partial(jax.jit, static_argnums=0)
 def _roll_out(env: st.TunnelEnv, params: EnvParams, key: jax.Array, actions: jax.Array) -> jax.Array:
-    """Return the observations of an episode, the first one included."""
     begin, go = jax.random.split(key)
     first, state = env.reset(begin, params)
 

@@ -55,14 +55,12 @@ def scene_track(case: Case) -> Track:
 
 
 def placed_data(model: mujoco.MjModel) -> mujoco.MjData:
-    """Return data with every geom at the model's first pose."""
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     return data
 
 
 def robot_body(model: mujoco.MjModel) -> int:
-    """Return the number of the first body that moves freely."""
     for joint in range(model.njnt):
         if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
             return int(model.jnt_bodyid[joint])
@@ -107,7 +105,6 @@ class RayPairs:
 
 @per_case
 def rays_from_axis(case: Case) -> RayPairs:
-    """Casts rays all around from random places of the centreline."""
     _, eye, _ = random_stations(case, "mj_ray_vs_mesh_mae", _EYES)
     way = case.rng("mj_ray_leak_rate").normal(size=(_EYES, _RAYS_PER_EYE, 3))
     way /= np.linalg.norm(way, axis=2, keepdims=True)
@@ -115,7 +112,6 @@ def rays_from_axis(case: Case) -> RayPairs:
 
 
 def ray_pairs(case: Case, eye: Float[np.ndarray, "e 3"], way: Float[np.ndarray, "e r 3"]) -> RayPairs:
-    """Casts rays from eyes in scene and mesh."""
     model = scene_model(case)
     reach, geom = scene_ranges(model, eye, way)
     flat = way.reshape(-1, 3)

@@ -45,7 +45,6 @@ def truth_bore_caster(case: Case) -> Caster:
 
 
 def row_stations(curve: curves.Curve) -> Float[np.ndarray, " n"]:
-    """Return the stations of the rows that medians are taken over, m."""
     return np.arange(curve.station[0] + 0.5 * curves.ROW_STEP, curve.station[-1], curves.ROW_STEP)
 
 
@@ -177,7 +176,6 @@ class Radii:
 
 
 def cast_radii(curve: curves.Curve, caster: Caster) -> Radii:
-    """Casts rays from a curve."""
     count = max(int(curve.length / ROW), 2)
     station = curve.station[0] + (np.arange(count) + 0.5) * curve.length / count
     radius = curves.cast_profile(caster, curve, station, curves.section_angles(COLUMNS))

@@ -220,7 +220,6 @@ def candidate_sleepers(case: Case) -> Float[np.ndarray, "s 3"]:
 
 
 def reference_sleepers(reference: Railway) -> Float[np.ndarray, "s 3"]:
-    """Return the reference's sleepers in its coordinates, by station, m."""
     return sort_along(reference.curve, reference.sleeper)
 
 

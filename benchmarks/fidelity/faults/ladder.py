@@ -24,7 +24,6 @@ _COLUMNS = ("kind", "words", "unit", "length", "places", "asked", "noticed_at_as
 
 
 def check_ladder(kinds: tuple[str, ...], places: int, draw: int = 0) -> None:
-    """Refuses a ladder that cannot be climbed anywhere."""
     if places < 1:
         raise FidelityError(f"places must be at least 1, got {places}")
     if draw < 0:
@@ -34,7 +33,6 @@ def check_ladder(kinds: tuple[str, ...], places: int, draw: int = 0) -> None:
 
 
 def rungs(kind: str) -> Float[np.ndarray, " r"]:
-    """Return the sizes of a kind's ladder, the smallest first."""
     return asked_faults()[kind].size * _RUNG ** np.arange(-_BELOW, _ABOVE + 1)
 
 
@@ -120,7 +118,6 @@ def sum_up(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def write_ladder(folder: Path, rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Writes `ladder.csv` and returns the table."""
     table = sum_up(rows)
     write_csv(folder / "ladder.csv", _COLUMNS, table)
     return table

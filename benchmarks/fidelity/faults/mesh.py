@@ -35,7 +35,6 @@ def copy_scene(candidate: Candidate, scratch: Path, changed: Callable[[Path], bo
 
 
 def edit_scene(candidate: Candidate, change: Callable[[mujoco.MjSpec], None]) -> Candidate:
-    """Changes the model of a copied candidate's scene."""
     spec = mujoco.MjSpec.from_file(str(candidate.scene))
     change(spec)
     spec.compile()
@@ -280,7 +279,6 @@ def _as_long_as(candidate: Candidate) -> int:
 
 
 def _middles(candidate: Candidate) -> list[float]:
-    """Return the middle of every `EACH` m, m."""
     count = _as_long_as(candidate)
     return [float(candidate.length * (k + 0.5) / count) for k in range(count)]
 
@@ -288,7 +286,6 @@ def _middles(candidate: Candidate) -> list[float]:
 @fault_kind("box", "a cube on the wall that is not there", "m", signed=False,
             sides=(0.0, np.pi, np.pi / 4, 3 * np.pi / 4))  # fmt: skip
 def add_box(site: Site, fault: Fault) -> Candidate:
-    """Puts a cube against the wall in the middle of the fault."""
     bore, station = site.candidate.bore, (fault.start or 0.0) + 0.5 * fault.length
     row = int(np.clip(np.searchsorted(bore.station, station), 0, len(bore.station) - 1))
     column = int(np.argmin(np.abs(np.angle(np.exp(1j * (bore.angle - fault.side))))))

@@ -22,7 +22,6 @@ from benchmarks.fidelity.references import Hold, Truth
 
 @fault_kind("turned", "held-out beams turned about the sensor's vertical and side axis", "rad")
 def turn_beams(site: Site, fault: Fault) -> Case:
-    """Turns the held-out beams about each sensor's own vertical and side axis."""
     hold = _require_hold(site.case)
     turn = Rotation.from_euler("zy", [fault.size, fault.size]).as_matrix()
     return replace(site.case, hold=replace(hold, direction=hold.direction @ turn.T, cache={}), cache={})

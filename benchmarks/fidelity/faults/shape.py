@@ -25,7 +25,6 @@ _SIDES = (0.0, np.pi)
 @kinds.fault_kind("wall", "one wall in or out", "m", sides=_SIDES)
 @kinds.fault_kind("roof", "roof too low or too high", "m", sides=(np.pi / 2,))
 def bulge(site: kinds.Site, fault: kinds.Fault) -> Candidate:
-    """Moves the part of the lining around an angle of the section."""
     way = np.array([0.0, np.cos(fault.side), np.sin(fault.side)])
 
     def push(local: kinds.Points) -> kinds.Points:

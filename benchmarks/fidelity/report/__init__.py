@@ -68,7 +68,6 @@ def report_content(
     judgement: Judgement,
     controls: list[dict[str, Any]] | None = None,
 ) -> dict[str, Any]:
-    """Return the content of `report.json`."""
     scored, null = judgement.scored["base"], judgement.scored["null"]
     worst = min((v, c) for c, v in scored.categories.items() if v is not None) if scored.evaluated else (None, None)
     rows = controls or []
@@ -110,7 +109,6 @@ def report_content(
 
 
 def _category_entries(scored: dict[str, Scored]) -> dict[str, dict[str, Any]]:
-    """Return name, score and the scores of null tube and truth of every category."""
     by = {key: scored[name].categories if name in scored else {} for key, name in _CANDIDATES.items()}
     return {
         name: {"name": words} | {key: scores.get(name) for key, scores in by.items()}
@@ -170,7 +168,6 @@ def report_title(case: Case) -> str:
 
 
 def _all_bold(rows: list[dict[str, Any]]) -> bool:
-    """Return True where every control was run at every dose that must fail."""
     asked = {(control.id, dose) for control in suite_controls().values() for dose in control.bold}
     return asked <= {(row["id"], row["dose"]) for row in rows}
 
@@ -208,7 +205,6 @@ def write_report(
     judgement: Judgement,
     controls: list[dict[str, Any]] | None,
 ) -> dict[str, Any]:
-    """Writes every form of the report and returns its content."""
     content = report_content(case, inputs, judgement, controls)
     rows = controls or []
     write_json(folder / "report.json", content)
@@ -267,7 +263,6 @@ def _join_pairs(entries: dict[str, str]) -> str:
 def write_html(
     folder: Path, report: dict[str, Any], figures: dict[str, tuple[Path, str]], controls: list[dict[str, Any]]
 ) -> Path:
-    """Writes `report.html`, one file with everything in it."""
     pictures = [
         {"name": name, "caption": caption, "data": base64.b64encode(path.read_bytes()).decode()}
         for name, (path, caption) in figures.items()
@@ -279,7 +274,6 @@ def write_html(
 
 
 def number_text(value: Any, digits: int = 4) -> str:
-    """Return a value for people; a dash for a missing one."""
     if value is None:
         return "\N{EN DASH}"
     if isinstance(value, float):

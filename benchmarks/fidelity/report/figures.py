@@ -35,7 +35,6 @@ class Sheet:
     report: dict[str, Any]  # Content of the report
 
     def note(self, n: int | None = None) -> str:
-        """Return the end of every caption: samples, seed, split."""
         hold = self.report["split"]["hold"]
         split = (f"held out: {hold['file']}" if hold["file"] else "held-out beams") if hold else "nothing held out"
         count = "" if n is None else f" n = {n:,}."

@@ -36,7 +36,6 @@ class Worst:
         return bool(self.error) or (self.value is not None and self.value > self.limit)
 
     def sentence(self) -> str:
-        """Return value, limit and place in words."""
         if self.error:
             return f"window {self.id} (against the {self.source}) could not be computed: {self.error}"
         assert self.value is not None
@@ -142,7 +141,6 @@ def judge_windows(case: Case) -> Windows:
 
 
 def dump_windows(found: Windows) -> dict[str, Any]:
-    """Return windows as plain data, with `beyond` for each."""
     return {
         "worst": [asdict(one) | {"beyond": one.beyond} for one in found.worst],
         "faults": [asdict(one) for one in found.noticed],

@@ -58,7 +58,6 @@ class Measure:
 
 
 def unrolled(case: Case, source: Source) -> deviation.Unrolled:
-    """Return the map of deviations against the held-out recording or the truth."""
     return deviation.hold_map(case) if source == "recording" else deviation.truth_map(case)
 
 
@@ -215,6 +214,5 @@ def limits(sensor: str = STANDARD_SENSOR) -> dict[str, float | None]:
 
 
 def sources(case: Case) -> tuple[Source, ...]:
-    """Return what the case can be judged by."""
     both: tuple[tuple[Source, object], ...] = (("recording", case.hold), ("truth", case.truth))
     return tuple(name for name, reference in both if reference is not None)
