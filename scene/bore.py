@@ -38,8 +38,6 @@ class Bore:
     filled: Bool[np.ndarray, " n"]  # Section interpolated
     ring_station: Float[np.ndarray, " r"]  # Ring joints, m
     pocket: Shaped[np.ndarray, " p"]  # Recesses of the lining, `(p,)` of `POCKET`
-    # Probability that the wall is within 5 cm of the true one, mean over the angles
-    confidence: Float[np.ndarray, " n"]
     # Bolts that bridge two pockets across a joint, `(b,)` of `NAIL`
     nail: Shaped[np.ndarray, " b"] = field(default_factory=lambda: np.empty(0, NAIL))
     # Ring joints by standard, where `ring_station` has the surveyed rings, m; else empty

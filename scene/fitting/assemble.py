@@ -10,7 +10,6 @@ from scene.cloud import Cloud
 from scene.errors import FitError, Refusal
 from scene.fitting.centreline import smooth_axis
 from scene.fitting.section import Sections, fit_sections
-from scene.fitting.unroll import probability_known
 from scene.geometry import Axis, find_runs, measure_section
 
 _MIN_COVERAGE = 0.4  # of the directions, within two rows: with less seen a section counts as filled
@@ -42,7 +41,7 @@ def bore_from_sections(axis: Axis, sections: Sections) -> Bore:
     return Bore(
         station, at.position, at.tangent, at.lateral, at.up, width, height, grid.angle, radius,
         spread, coverage, coverage < _MIN_COVERAGE,
-        np.empty(0), np.empty(0, POCKET), probability_known(sections.sigma).mean(axis=1)[low],
+        np.empty(0), np.empty(0, POCKET),
     )  # fmt: skip
 
 
@@ -76,13 +75,12 @@ _STRAIGHT = 1e-5  # 1/m
 
 
 def describe_bore(bore: Bore) -> dict[str, Any]:
-    """Return residual, coverage, confidence and alignment for the manifest; a straight bore has no plan radius."""
+    """Return residual, coverage and alignment for the manifest; a straight bore has no plan radius."""
     axis = bore.axis
     bend = float(np.abs(axis.curvature).max())
     return {
         "residual_rms": float(np.sqrt(np.mean(bore.residual_rms**2))),
         "coverage": float(bore.coverage.mean()),
-        "confidence": float(bore.confidence.mean()),
         "least_plan_radius": 1 / bend if bend > _STRAIGHT else None,
         "grade": [float(axis.grade.min()), float(axis.grade.max())],
     }

@@ -12,7 +12,6 @@ from scene.bore import POCKET, STATION_STEP, Bore
 from scene.errors import FitError, Refusal
 from scene.fitting.assemble import describe_bore
 from scene.fitting.lining import LiningConfig, add_standard_lining, joints_by_number
-from scene.fitting.unroll import UNSEEN_GROWTH, probability_known
 from scene.geometry import arc_length, axis_through, section_angles
 from scene.reading.ringsurvey import RingSurvey
 
@@ -86,8 +85,6 @@ def bore_from_rings(fit: RingFit, origin: Float[np.ndarray, "3"]) -> Bore:
         filled=distance > STATION_STEP,
         ring_station=at,
         pocket=np.empty(0, POCKET),
-        confidence=np.interp(axis.station, at, fit.seen)
-        * probability_known(np.hypot(np.interp(axis.station, at, fit.rms), UNSEEN_GROWTH * distance)),
     )
 
 

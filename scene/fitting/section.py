@@ -115,7 +115,6 @@ class Sections:
     deepest: Float[np.ndarray, "rows cols"]  # Furthest return behind the wall, m; 0 where there is none
     spread: Float[np.ndarray, " rows"]  # Inlier distance rms of each row, m
     inlier: Bool[np.ndarray, "rows cols"]  # Cells that the wall was fitted to
-    sigma: Float[np.ndarray, "rows cols"]  # Standard deviation of the wall's radius, m
     flat_floor: bool  # True where the section stands on a flat floor
     voxel: float  # Thinning of the cloud it was fitted to, m
 
@@ -160,8 +159,7 @@ def fit_sections(cloud: Cloud, axis: Axis, behind: Float[np.ndarray, "k 3"] | No
     coarse = next((grid for grid in grids if _share_of_cells(points, grid) >= _MIN_COVERAGE), grids[0])
     wall = _first_wall(points, coarse, fine, floors, stand_in)
     _require_open_middle(points, fine, wall)
-    wall, seen = _follow_wall(points, wall, fine, floors)
-    return _measure_wall(points, wall, unroll.estimate_sigma(wall, seen, fine), fine, floors is not None, cloud.voxel)
+    return _measure_wall(points, _follow_wall(points, wall, fine, floors), fine, floors is not None, cloud.voxel)
 
 
 def _share_of_cells(points: _Points, grid: Grid) -> float:
@@ -195,10 +193,8 @@ def _require_open_middle(points: _Points, fine: Grid, wall: np.ndarray) -> None:
         raise FitError(why, Refusal.NO_BORE)
 
 
-def _follow_wall(
-    points: _Points, first: np.ndarray, fine: Grid, floors: Floors | None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the wall at the half-metre scale, and the cells that it was fitted to."""
+def _follow_wall(points: _Points, first: np.ndarray, fine: Grid, floors: Floors | None) -> np.ndarray:
+    """Return the wall at the half-metre scale."""
     cell, outward = points.outward_of(first, fine)
     residual, weight = unroll.cell_means(fine, cell, outward, points.weight)
     corner = _cut_corners(first, residual, weight, fine)
@@ -211,7 +207,7 @@ def _follow_wall(
     correction *= np.clip(support / _SEEN_WEIGHT, 0.0, 1.0)
     if floors is not None:
         correction[is_floor(first, fine, floors)] = 0.0
-    return first + correction, inlier
+    return first + correction
 
 
 def _cut_corners(first: np.ndarray, residual: np.ndarray, weight: np.ndarray, fine: Grid) -> np.ndarray:
@@ -240,9 +236,7 @@ def _cut_corners(first: np.ndarray, residual: np.ndarray, weight: np.ndarray, fi
     return result
 
 
-def _measure_wall(
-    points: _Points, wall: np.ndarray, sigma: np.ndarray, fine: Grid, flat_floor: bool, voxel: float
-) -> Sections:
+def _measure_wall(points: _Points, wall: np.ndarray, fine: Grid, flat_floor: bool, voxel: float) -> Sections:
     """Measures what the points show of the wall that was fitted to them."""
     cell, outward = points.outward_of(wall, fine)
     residual, weight = unroll.cell_means(fine, cell, outward, points.weight)
@@ -255,5 +249,5 @@ def _measure_wall(
     spread = np.sqrt(squares / np.maximum(support.sum(axis=1), 1e-9))
     inlier = (weight > 0) & (np.abs(residual) < _NEAR_WALL)
     return Sections(
-        fine, wall, residual, weight, support, deepest.reshape(wall.shape), spread, inlier, sigma, flat_floor, voxel
+        fine, wall, residual, weight, support, deepest.reshape(wall.shape), spread, inlier, flat_floor, voxel
     )  # fmt: skip

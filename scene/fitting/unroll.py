@@ -1,11 +1,10 @@
-"""The wall rolled out flat: a grid over station and angle, what no scanner saw of it, and how sure each cell is."""
+"""The wall rolled out flat: a grid over station and angle, and what no scanner saw of it."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
-from scipy.special import erf
 
 from scene.geometry import angle_bins, bin_angles
 
@@ -138,43 +137,6 @@ def resample(wall: np.ndarray, coarse: Grid, fine: Grid) -> np.ndarray:
     left = np.floor(column).astype(np.intp)
     part = column - left
     return (1 - part) * along[:, left % coarse.columns] + part * along[:, (left + 1) % coarse.columns]
-
-
-TOLERANCE = 0.05  # m; "known" is known within this
-_AROUND = (3, 2)  # cells of 5 cm × 1° that one return speaks for
-_SEEN_SIGMA = 0.01  # m, standard deviation of a wall seen in nearly every cell
-UNSEEN_GROWTH = 0.02  # m for each metre from the nearest cell seen, however even the wall is elsewhere
-_LAGS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)  # m
-
-
-def estimate_sigma(
-    wall: Float[np.ndarray, "rows cols"], seen: Bool[np.ndarray, "rows cols"], grid: Grid
-) -> Float[np.ndarray, "rows cols"]:
-    """Estimates the standard deviation of a wall that was interpolated over unseen cells, m.
-
-    It is the root mean square change of this wall over the distance along the bore to the nearest cell that was seen;
-    where a whole direction was not seen, over 8 m, the greatest distance tried. It is at least 2 cm for each metre.
-    """
-    near = ndimage.binary_dilation(seen, np.ones((2 * _AROUND[0] + 1, 2 * _AROUND[1] + 1), bool))
-    sampling = (grid.step, 2 * np.pi * float(np.median(wall)) / grid.columns)
-    wrapped = np.concatenate([near, near, near], axis=1)
-    distance = ndimage.distance_transform_edt(~wrapped, sampling=sampling)[:, grid.columns : 2 * grid.columns]
-    lags = [lag for lag in _LAGS if round(lag / grid.step) < grid.rows] or [grid.step]
-    change = [_wall_change(wall, near, max(round(lag / grid.step), 1)) for lag in lags]
-    held = np.interp(distance, [0.0, *lags], [0.0, *np.maximum.accumulate(change)])
-    return np.hypot(_SEEN_SIGMA, np.maximum(held, UNSEEN_GROWTH * distance))
-
-
-def _wall_change(wall: np.ndarray, seen: np.ndarray, rows: int) -> float:
-    """Root mean square difference of seen cells so many rows apart, m."""
-    both = seen[rows:] & seen[:-rows]
-    difference = (wall[rows:] - wall[:-rows])[both]
-    return float(np.sqrt(np.mean(difference**2))) if len(difference) else 0.0
-
-
-def probability_known(sigma: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-    """Return the probability that an error of standard deviation `sigma`, m, is below 5 cm."""
-    return erf(TOLERANCE / np.maximum(sigma, 1e-9) / np.sqrt(2))
 
 
 _WIDEST_GAP = np.deg2rad(120.0)  # a wider gap has no two ends that a line could join

@@ -139,11 +139,10 @@ def _warn_of_share(
     result = []
     if inside + behind > config.warn_above:
         where = f", most {name_span(*worst[0][:2])}" if worst else ""
-        look = f", where it looks like {places[0].look}" if places else ""
         result.append(Warned(
             Code.UNEXPLAINED,
             f"{inside + behind:.0%} of the returns lie further than {100 * config.tolerance:.0f} cm from the tunnel "
-            f"that was built ({inside:.0%} inside it, {behind:.0%} behind its wall){where}{look}",
+            f"that was built ({inside:.0%} inside it, {behind:.0%} behind its wall){where}",
             refuses=inside + behind > config.refuse_above,
         ))  # fmt: skip
     return result
@@ -194,8 +193,8 @@ def _warn_of_places(places: tuple[Place, ...], tolerance: float) -> list[Warned]
         Warned(
             Code.PLACE,
             f"{name_span(place.start, place.end)}, {place.sides}: {place.share:.0%} of the returns there are not the "
-            f"wall that was built, up to {place.furthest:.1f} m {'behind' if place.behind else 'inside'} it: "
-            f"{place.look}",
+            f"wall that was built, up to {place.furthest:.1f} m {'behind' if place.behind else 'inside'} it, "
+            f"{place.low:.1f} to {place.high:.1f} m above the floor",
             place.start, place.end,
         )
         for place in places[:_LISTED] if place.share > _WARN_LOCAL and place.furthest > tolerance

@@ -226,7 +226,8 @@ def _tables(judgement: Judgement, content: dict[str, Any]) -> list[str]:
         for part in content.get("removed", [])
     ]
     places = [
-        (name_span(place.start, place.end), "behind the wall" if place.behind else "inside", place.sides, place.look,
+        (name_span(place.start, place.end), "behind the wall" if place.behind else "inside", place.sides,
+         f"{place.low:.1f} to {place.high:.1f} m above the floor",
          f"{place.returns:,.0f} returns, {place.share:.1%} of those there")
         for place in judgement.places
     ]  # fmt: skip

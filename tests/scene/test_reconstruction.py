@@ -94,13 +94,7 @@ def test_curvature_and_grade_are_in_the_bore_file(tmp_path):
         np.testing.assert_allclose(sign * data["curvature"][inner], 1 / 150, rtol=0.1)
         np.testing.assert_allclose(sign * data["grade"], 0.01, atol=0.003)
     again = load_bore(tmp_path / "bore.npz")
-    np.testing.assert_array_equal(again.confidence, bore.confidence)
     np.testing.assert_array_equal(again.radius, bore.radius)
-
-
-def test_confidence_is_high_on_a_wall_that_was_seen():
-    bore, _ = rebuilt(swept("circle", 20, yaw=0.1), midline("circle", 20, yaw=0.1))
-    assert bore.confidence.min() > 0.99
 
 
 RAILS, RAIL_TOP = 0.75, 0.24
