@@ -112,16 +112,6 @@ def test_a_niche_or_a_stub_does_not_pull_the_axis_aside(depth):
     assert len(warnings) == (depth > 3)
 
 
-def test_a_branch_is_cut_at_its_mouth_with_its_place():
-    result = cleaned(turned(arch(Tube((15, 0), (15, 14), 4.0, 4.5))))
-    require_axis_in_the_middle(result, within=0.05)
-    (part,) = [part for part in result.removed if part.warning]
-    assert part.cause == Cause.BRANCH
-    assert "branch" in part.warning
-    mouth = turned(np.array([[15.0, 4.0, 2.0]]))[0]
-    assert np.linalg.norm(np.subtract(part.place, mouth)) < 2.0
-
-
 def test_of_two_tunnels_the_longer_is_built_with_a_warning():
     shorter = cavity(Tube((4, 20), (24, 20))) - PLACE
     result = cleaned(turned(np.concatenate([arch(), shorter])))

@@ -145,13 +145,6 @@ def test_a_lower_floor_is_one_that_lies_well_below_the_first(plateau, lower):
     assert not lower or found[0] == pytest.approx(-2.0, abs=0.01)
 
 
-def test_without_the_search_below_the_floor_would_be_a_plateau_over_the_track(monkeypatch):
-    monkeypatch.setattr(floor, "find_lower_line", lambda *_: None)
-    world = World(arch(5.1, 5.5, 3.0), L, PROUD)
-    _, error = built(world, SCANS["vlp16"](world), 0.04)
-    assert np.median(error) > 0.1
-
-
 def bedded(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Station, lateral and upward place of a bore whose floor sways, and drops by 2 m beside a bed from 20 to 40 m."""
     station = rng.uniform(0.0, 60.0, count)

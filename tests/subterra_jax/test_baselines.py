@@ -141,13 +141,6 @@ def test_where_a_corner_is_near_it_turns_steeper_to_its_lane_than_where_the_way_
     assert abs(heading(there, params)) < 0.05
 
 
-def test_who_knows_the_truth_comes_back_always():
-    env, params = st.make("Subterra/Return-v1", tunnel="subterra-351")
-    records = evaluate(env, params, make_agent("oracle", params), listed_episodes(env, params, 50))
-    assert records.success.all()
-    assert (np.abs(records.goal_error) < 0.05).all()
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("task", "least"), [("Return", 1.0), ("Obstructed", 0.97), ("Faulted", 0.99), ("Relocalise", 1.0)]

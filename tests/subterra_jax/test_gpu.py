@@ -14,7 +14,6 @@ from subterra_jax import lidar
 from subterra_jax.lidar import gpu, nvidia
 from subterra_jax.parts import unicycle
 from subterra_jax.tunnel import CONTACT_REACH, Tunnel, node_at, packed
-from subterra_jax.tunnel.tunnel import stack
 from tests.subterra_jax.lowering import for_nvidia
 from tests.subterra_jax.modes import wide
 
@@ -188,17 +187,6 @@ def test_clearances_are_those_of_xla_and_of_brute_force(name: str | None) -> Non
     assert (~near).sum() > 100
     np.testing.assert_allclose(found[near], truth[near], atol=1e-5)
     assert np.all(found[truth > 0.81] == REACH)
-
-
-def test_each_tunnel_of_a_stack_has_its_own_distances(plan: st.TunnelPlan) -> None:
-    plans = [plan, piece_of(NAMES[4]), piece_of(NAMES[2])]
-    tunnels = [Tunnel.from_plan(each, block_length=0.4) for each in plans]
-    joined = stack(tunnels)
-    for i, (each, tunnel) in enumerate(zip(plans, tunnels, strict=True)):
-        position, station = places(each, each.default_lining, i)
-        found, by_xla = both(joined.walls, position, nodes(joined.pick(i), station))
-        assert_equal(found, by_xla)
-        assert_equal(found, both(tunnel, position, nodes(tunnel, station))[0])
 
 
 @pytest.mark.parametrize("bits", [32, 64])

@@ -84,20 +84,6 @@ def test_ten_seconds_integrated_give_the_motion_to_a_millimetre_and_a_hundredth_
     assert np.rad2deg(away) < 0.01
 
 
-def test_at_rest_it_reads_gravity_with_the_grade():
-    env, params = made(IDEAL)
-    first, states = drive(env, params, np.zeros((5, 2)))
-    for samples in (first.imu.samples, *states.imu.samples):
-        force, turn = np.asarray(samples)[:, :3], np.asarray(samples)[:, 3:]
-        np.testing.assert_allclose(np.linalg.norm(force, axis=1), GRAVITY, rtol=1e-5)
-        np.testing.assert_allclose(turn, 0.0, atol=1e-5)
-        # Uphill the seat pushes from behind.
-        up = np.hypot(1.0, GRADE)
-        tilt = GRADE * np.cos(float(first.heading) - float(first.station) / 40.0) / up
-        np.testing.assert_allclose(force[:, 0], GRAVITY * tilt, atol=5e-3)
-        np.testing.assert_allclose(force[:, 2], GRAVITY / up, rtol=1e-4)
-
-
 def allan(values, rate, tau):
     """Allan deviation at one averaging time, overlapping."""
     n = round(tau * rate)

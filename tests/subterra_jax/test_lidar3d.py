@@ -13,7 +13,7 @@ import pytest
 from subterra_jax import lidar3d, native
 from subterra_jax.lidar import nvidia
 from subterra_jax.lidar3d import beams, casting, finding, fused
-from subterra_jax.lidar3d.relief import ARRAYS, Relief, stack_reliefs
+from subterra_jax.lidar3d.relief import ARRAYS, Relief
 from subterra_jax.lidar3d.surface import BOX_CORNERS, BOX_FACES, Axis, Triangles
 from tests.subterra_jax import surfaces
 from tests.subterra_jax.lowering import for_nvidia
@@ -252,34 +252,6 @@ def test_machine_code_and_xla_give_the_same_ranges(bend, reliefs, name):
     triangle = np.asarray(reliefs[name].entry)
     # A ray may meet one triangle in the list of either of two cells.
     assert (triangle[np.asarray(xla.entry)] == triangle[np.asarray(code.entry)]).mean() > 0.98
-
-
-def test_rays_marched_a_few_at_a_time_meet_what_all_meet_in_step(bend, reliefs, monkeypatch):
-    rays = bend_rays(bend[0], 56, 6)
-    whole, _ = found_by(finding.by_xla, reliefs["bend"], *rays)
-    monkeypatch.setattr(finding, "IN_STEP", 9)
-    few, _ = found_by(lambda *arguments: finding.by_xla(*arguments), reliefs["bend"], *rays)
-    np.testing.assert_array_equal(whole.entry, few.entry)
-    np.testing.assert_allclose(whole.distance, few.distance, rtol=1e-6)
-
-
-def test_bores_picked_from_a_stack_give_what_each_gives_alone(bend, reliefs):
-    alone = [relief_of(*bend), reliefs["things"], reliefs["tube"]]
-    joined = stack_reliefs(alone)
-    assert joined.count == 3
-    origin, way, station = bend_rays(surfaces.axis_of(44.0), 48, 7)
-    which = np.arange(48) % 3
-
-    def one(i, o, d, s):
-        return lidar3d.cast(joined.pick(i), o, d[None], s, 30.0)[0]
-
-    ranges = np.asarray(jax.jit(jax.vmap(one))(which, origin, way, station))
-    for k, relief in enumerate(alone):
-        rows = which == k
-        expected = jax.vmap(lidar3d.cast, (None, 0, 0, 0, None))(
-            relief, origin[rows], way[rows][:, None], station[rows], 30.0
-        )
-        np.testing.assert_array_equal(ranges[rows], expected[:, 0])
 
 
 @pytest.mark.parametrize("name", ["bend", "things"])

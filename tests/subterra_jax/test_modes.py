@@ -70,16 +70,6 @@ def drive_by(driver: str, env: st.TunnelEnv, params: st.EnvParams, n_envs: int, 
 
 
 @pytest.mark.slow
-def test_the_same_episodes_come_out_and_an_agent_drives_alike():
-    task = "Subterra/Faulted-v1"
-    env, params = st.make(task, horizon=12)
-    plain = drive_by("dead-reckoning", env, params, 6, 25)
-    with wide(), strict():
-        env, params = st.make(task, horizon=12)
-        assert_same(plain, drive_by("dead-reckoning", env, params, 6, 25))
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("task", [id for id in st.TASKS])
 @pytest.mark.parametrize("fused", [True, False])
 def test_the_same_episodes_of_every_task_come_out(task, fused):

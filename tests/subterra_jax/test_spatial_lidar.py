@@ -157,18 +157,6 @@ def test_a_sweep_of_the_vlp16_falls_on_the_walls_only_when_deskewed_with_the_tru
     assert np.quantile(walls_missed(points(np.full(len(times), 0.1))), 0.9) > 0.02
 
 
-@pytest.mark.slow
-def test_a_robot_that_stands_sees_the_same_with_and_without_a_sweep():
-    scans = []
-    for sweep in (False, True):
-        env, params = st.make(
-            TASK, tunnel=straight(), sensor=exact(beams.spinning(np.array([-0.1, 0.1]), 8)), sweep=sweep
-        )
-        obs, _ = env.reset(jax.random.key(0), params)
-        scans.append(obs[:16])
-    np.testing.assert_allclose(*scans, atol=1e-4)
-
-
 def test_noise_grows_with_range_and_incidence_as_it_says():
     params, n = echo.EchoParams(), 40_000
     normal = jax.random.normal(jax.random.key(0), (n,))
@@ -288,13 +276,10 @@ def test_every_number_of_a_named_sensor_is_the_one_written_here(name):
 def test_what_is_nearer_than_the_least_range_is_no_return(graded):
     """Beams to the left wall, 2.8 m away, and ahead and up, further away; the least range lies between."""
     beam = np.array([[0.0, 1.0, 0.0], [0.0, np.cos(1.2), np.sin(1.2)]])
-    found = {}
-    for least in (0.0, 2.9):
-        env, params = st.make(TASK, tunnel=graded, sensor=exact(beam, range_min=least))
-        found[least] = observe(env, placed(env, params, 15.0, 0.0, 0.0), params)["scan"]
-    assert found[0.0][0] == pytest.approx(HALF, abs=0.01)
-    assert found[0.0][1] > 2.9
-    np.testing.assert_allclose(found[2.9], [30.0, found[0.0][1]], atol=1e-5)
+    env, params = st.make(TASK, tunnel=graded, sensor=exact(beam, range_min=2.9))
+    left, above = observe(env, placed(env, params, 15.0, 0.0, 0.0), params)["scan"]
+    assert left == 30.0
+    assert 2.9 < above < 30.0
 
 
 def test_the_vlp16_fires_its_lasers_in_the_order_of_the_manual():

@@ -9,9 +9,7 @@ import pytest
 
 import subterra_jax as st
 from benchmarks import reference
-from subterra_jax import lidar, lidar3d
-from subterra_jax.lidar3d import beams
-from subterra_jax.tunnel import Tunnel
+from subterra_jax import lidar3d
 
 N = 64
 
@@ -32,20 +30,6 @@ def scans(relief: lidar3d.Relief, which: np.ndarray, poses: reference.Poses, hei
         return lidar3d.scan(relief.pick(k), p, q, s, jnp.asarray(beam), 30.0)
 
     return np.asarray(jax.jit(jax.vmap(one))(which, place, turn, poses.station))
-
-
-def test_level_beams_in_a_family_of_raised_tunnels_give_the_planar_ranges(family) -> None:
-    plans, relief = family
-    params = lidar.LidarParams()
-    for k, plan in enumerate(plans):
-        poses = reference.random_poses(plan, N, np.random.default_rng(k))
-        planar = jax.vmap(lidar.scan, (None, 0, 0, 0, None))(
-            Tunnel.from_plan(plan), *map(jnp.asarray, (poses.position, poses.heading, poses.station)), params
-        )
-        ranges = scans(relief, np.full(N, k), poses, plan.lidar_height, beams.planar(16))
-        error = np.abs(ranges - np.asarray(planar))
-        assert np.median(error) < 2e-5
-        assert (error < 1e-3).mean() > 0.995
 
 
 def test_beams_up_and_down_meet_crown_and_floor(family) -> None:

@@ -75,8 +75,3 @@ def test_robots_whose_truth_alone_differs_read_and_do_the_same_and_are_asked_for
     np.testing.assert_allclose(driver.log_prob(out, one.raw), one.log_prob, atol=1e-5)
     assert one.error.shape == (1, 2, 1)
     assert jnp.abs(one.error).max() < 1.0  # at the start nothing is off but the odometer
-
-
-def test_one_seed_gives_one_result(world):
-    one, other = (train(make_learner(world, TINY), world.params) for _ in range(2))
-    jax.tree.map(np.testing.assert_array_equal, one.state.student.weights, other.state.student.weights)
