@@ -75,7 +75,8 @@ def test_a_stage_is_for_looks_alone(plan):
 def test_the_walls_show_the_brightness_that_a_lidar_reads(plan):
     begin, end = 200.0, 206.0
     model = stage_spec(Piece(plan, "smooth", begin, end, 1.0)).compile()
-    wide, high, first = (int(part[1]) for part in (model.tex_width, model.tex_height, model.tex_adr))
+    own = model.tex("wall").id
+    wide, high, first = (int(part[own]) for part in (model.tex_width, model.tex_height, model.tex_adr))
     pixels = model.tex_data[first : first + 3 * wide * high].reshape(high, wide, 3)[..., 0]
     (wall,) = (one for one in tunnel_surfaces(plan, "smooth", begin, end) if one.name == "wall")
     mesh = int(model.geom_dataid[model.geom("tunnel wall").id])
