@@ -64,7 +64,6 @@ class AutoReset:
 
         Args:
             key: One key for the whole batch.
-            state: Batched state.
             action: Speeds (m/s) and yaw rates (rad/s), and what `TunnelEnv.action_size` adds.
             params: The task; batched as `params_axes` says.
 
@@ -180,14 +179,10 @@ def rollout(
     with other weights. Inside a function that is compiled or differentiated itself it becomes a part of that.
 
     Args:
-        env: The batch.
         policy: Key and observations to actions `(n_envs, n_action)`, pure; or a policy with memory, from `load_policy`
             or of one's own after `subterra_jax.policies.Policy`. Its memory begins anew with every episode. It is
             traced once in each call.
         key: Source of the policy's and the environments' randomness.
-        obs: Observations to begin with.
-        state: State to begin with.
-        params: The task.
         n_steps: Steps to take.
         memory: Memory to begin with, `memory` of an earlier call; None where the episodes begin here.
 

@@ -139,7 +139,6 @@ def run_compiled(function: Callable[..., Any], *args: Any) -> Any:
 
     Args:
         function: Function of pytrees of arrays that returns one.
-        *args: Its arguments.
     """
     if _is_traced(args):
         return function(*args)

@@ -77,8 +77,6 @@ class Driver:
         """Begin one episode, or one for each of an array of seeds.
 
         Args:
-            params: The task, not batched.
-            agent: The agent that drives.
             seed: Seed of everything random, `()` or `(n,)`.
             tunnel: Number of the tunnel in a stack, of the same shape.
             level: Level of difficulty, of the same shape; None to let the episode draw it.
@@ -104,8 +102,6 @@ class Driver:
         device does not tell.
 
         Args:
-            params: The task, not batched.
-            agent: The agent that drives.
             n: Number of episodes.
             n_steps: Steps of one call of `go`.
         """
@@ -135,11 +131,6 @@ def ask(
     """Ask an agent for an action; it gets only the inputs that it declares.
 
     Args:
-        env: The environment.
-        agent: The agent.
-        key: Source of its randomness.
-        memory: Its memory.
-        obs: The observation, from `look`.
         state: The true state, of which only a privileged agent is told.
         here: The task in the tunnel that the robot is in.
     """

@@ -22,7 +22,6 @@ def collect_entries(env: TunnelEnv, overrides: Mapping[str, Any]) -> dict[str, A
     """Gather the entries of `EnvParams` that motion, parts and rule of an environment read.
 
     Args:
-        env: The environment.
         overrides: Entries in place of the defaults.
 
     Raises:

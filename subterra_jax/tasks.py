@@ -126,7 +126,6 @@ def find(id: str, short: bool = False) -> str:
     """Return the id of a task; `MODULE:ID` and `FILE.py:ID` first run a user's module, which registers the task.
 
     Args:
-        id: The id.
         short: Take `StopAt` for `Subterra/StopAt-v1`, as command lines do.
 
     Raises:
@@ -254,7 +253,6 @@ def tunnel_for(
     """Return what `make` takes for the tunnel of a task.
 
     Args:
-        id: The task's id.
         tunnel: As for `make`.
         split: As for `make`.
         spatial: The LiDAR is one in three dimensions, whose surfaces take longer to make: short tunnels are taken.
@@ -318,7 +316,6 @@ def constants_digest(env: TunnelEnv | None = None, params: EnvParams | None = No
 
     Args:
         env: An environment; None for all planar tasks with their default params, and the open world's kinds and splits.
-        params: Its params.
     """
     if env is None or params is None:
         return _benchmark_digest()

@@ -56,7 +56,6 @@ class TunnelEnv:
 
         Args:
             key: Source of everything that is drawn for the episode, and of the first scan's noise.
-            params: The task.
 
         Returns:
             First observation and state.
@@ -72,10 +71,7 @@ class TunnelEnv:
         """Take one step, without a reset at its end: `AutoReset` resets.
 
         Args:
-            key: Source of everything random in the step.
-            state: State before.
             action: Speed (m/s) and yaw rate (rad/s), and what `action_size` adds; clipped, NaN read as 0.
-            params: The task.
 
         Returns:
             Observation, state, reward, terminated, truncated and info. An episode that ends at the horizon with success
@@ -150,10 +146,7 @@ class TunnelEnv:
         """Take one step but its observation: motion, contact, parts, reward and the end of the episode.
 
         Args:
-            state: State before.
             action: As for `step`.
-            noise: Random numbers of the step.
-            params: The task.
 
         Returns:
             State, reward, terminated, truncated and info.
@@ -209,9 +202,6 @@ class TunnelEnv:
         """Observe a state.
 
         Args:
-            state: The state.
-            noise: Random numbers of the step.
-            params: The task.
             wanted: Someone will read the observation; where not, ranges may be anything.
 
         Returns:

@@ -18,7 +18,6 @@ import pytest
 import tyro
 
 from subterra_jax.baselines import registry
-from subterra_jax.procedural import kinds
 from tests.test_extend import FILES, forget
 
 ROOT = Path(__file__).parents[1]
@@ -70,7 +69,6 @@ def reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "out" / "short" / "config.json").write_text(json.dumps(run))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(registry, "_FACTORIES", dict(registry._FACTORIES))
-    monkeypatch.setattr(kinds, "_OWN", {})
     forget()
     return tmp_path
 

@@ -1,6 +1,5 @@
 """The page about extensions: its files, from outside the package, work wherever a task or a sensor is taken."""
 
-import dataclasses
 import json
 import re
 import sys
@@ -18,7 +17,6 @@ from subterra_jax.evaluation import evaluate, listed_episodes
 from subterra_jax.host import task_ids
 from subterra_jax.host.loading import load_file
 from subterra_jax.parts import Part
-from subterra_jax.procedural import kinds, open_world
 from subterra_jax.rules import Rule, Start, StopAt, Traverse, Verdict
 from tests.train.conftest import SMALL, call
 
@@ -43,7 +41,6 @@ def desk(tmp_path, monkeypatch):
         (tmp_path / name).write_text(text)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setattr(kinds, "_OWN", {})
     forget()
     yield tmp_path
     forget()
@@ -177,53 +174,6 @@ def test_a_policy_is_trained_on_a_task_reward_and_sensor_from_outside(desk, task
     assert lines[-1][term] < 0.0
     agent, _ = policies.load("run")
     assert agent.layout.shape.n_inputs == 42  # of a plain task 41: the file's own number is read too
-
-
-STEEL = "steel.py:open:steel"
-
-
-def test_a_kind_of_lining_from_outside_is_drawn_with_its_own_relief(desk):
-    name = f"{STEEL}:train:0"
-    wall = st.load_tunnel(name).lining("built").left
-    assert wall.vertex.shape == st.load_tunnel("open:steel:train:0").lining("built").left.vertex.shape
-    bore = open_world.draw("open:steel:train:0", 60.0).bore
-    around = int(np.argmax(bore.grid.girth > 0.5 * bore.grid.girth.max()))
-    relief = (bore.radius(np.array([around])) - bore.radius(np.array([around]), smooth=True))[:, 0]
-    at = np.exp(2j * np.pi * bore.grid.station / 0.381)
-    assert 2.0 * abs(np.mean(relief * at)) == pytest.approx(0.07, rel=0.05)
-    # Roughness of a few millimetres is all else.
-    assert np.std(relief) == pytest.approx(0.07 / np.sqrt(2.0), rel=0.1)
-
-
-def test_agents_drive_in_a_kind_of_lining_from_outside(desk):
-    env, params = st.make("Subterra/StopAtShort-v1", tunnel=f"{STEEL}:train:0-1")
-    assert params.tunnel.count == 2
-    obs, _ = jax.jit(env.reset)(jax.random.key(0), params)
-    assert np.isfinite(obs).all()
-    assert st.load_tunnel(f"{STEEL}:val:1", solid=True).shell is not None
-
-
-def test_a_kind_of_lining_from_outside_leaves_the_benchmark_as_it_is(desk):
-    names = [f"open:test-unseen:{index}" for index in range(6)]
-    before = [open_world.draw(name, 30.0).bore.kind.name for name in names]
-    figures = open_world.figures()
-    load_file(desk / "steel.py")
-    assert [open_world.draw(name, 30.0).bore.kind.name for name in names] == before
-    assert open_world.figures() == figures
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"name": "cast"}, "'cast' is a kind of the benchmark"),
-        ({"name": "St eel"}, "a kind's name must be of small letters, got 'St eel'"),
-        ({"name": "steel", "fixtures": ("lift",)}, "no furniture 'lift'; there are bracket, "),
-    ],
-)
-def test_a_kind_of_lining_that_cannot_be_is_refused(changes, message):
-    with pytest.raises(ValueError, match=message):
-        kinds.register_kind(dataclasses.replace(kinds.KINDS["rock"], **changes))
-    assert set(kinds.all_kinds()) == set(kinds.KINDS)
 
 
 class Twice(Part):

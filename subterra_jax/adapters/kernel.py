@@ -191,8 +191,6 @@ def programs_of(env: TunnelEnv, params: EnvParams, shapes: tuple[Any, Report], c
     """Return the programs of an environment; a second one with the same params takes those of the first.
 
     Args:
-        env: The environment.
-        params: Its params.
         shapes: Shapes and dtypes of a state and of a report.
         compile: As `compile_with_params`.
     """

@@ -56,8 +56,6 @@ class Task:
     """An environment, its params and what follows from them. Nothing in it changes, so that copies share it.
 
     Args:
-        env: The environment.
-        params: Its params.
         flat: Return a plain vector for every task; a task with `PAPER_FIELDS` alone does so anyway.
         compile: Compiles reset and step of a single environment.
 

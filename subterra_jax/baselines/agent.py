@@ -77,8 +77,6 @@ class Agent(Protocol):
         """Returns the memory at the start of an episode: any pytree of arrays.
 
         Args:
-            key: Source of the agent's own randomness.
-            obs: First observation.
             params: The task: sizes of noises, the believed start, tolerances.
         """
 
@@ -88,9 +86,7 @@ class Agent(Protocol):
         """Returns the action of one control period, and the memory after it.
 
         Args:
-            key: Source of the agent's own randomness.
             memory: Memory so far. The first call gets the observation that `begin` got.
-            obs: The observation.
             params: As for `begin`.
             known: The truth; None for an agent that is not `privileged`.
 
@@ -134,8 +130,6 @@ def observed(env: TunnelEnv, params: EnvParams, flat: Float[Array, "n_obs"], see
 
     Args:
         env: The environment that made it.
-        params: The task.
-        flat: The observation.
         sees: Show the ranges; NaN otherwise.
     """
     fields = env.fields(params)

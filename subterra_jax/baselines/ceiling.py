@@ -29,7 +29,6 @@ def ceiling(params: EnvParams, n_particles: int | None = None) -> Navigator:
     """Makes the ceiling of a task: particles about a start, and a histogram over all places where there is none.
 
     Args:
-        params: The task.
         n_particles: Number of particles; None is 512, twice that on wet rail, and twice that with a hidden start.
     """
     if params.errand == "report":

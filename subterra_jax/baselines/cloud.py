@@ -134,12 +134,9 @@ def move(
     """Moves a cloud by one step.
 
     Args:
-        key: Key of the noise.
-        cloud: The cloud before.
         walls: The map, for the curvature.
         travelled: Dead-reckoned distance, m.
         turned: Dead-reckoned turn, rad; NaN is unknown, and replaced by that of the axis.
-        params: Motion of the cloud.
     """
     n = cloud.scale.shape[0]
     normal = jax.random.normal(key, (2, n))

@@ -58,7 +58,6 @@ def exact_likelihood(
         pose: Poses, each field `(n,)`, fitted to the scan.
         ranges: The scan, m.
         params: The task in that tunnel.
-        exact: Settings of the likelihood.
 
     Returns:
         The largest over offset and heading, up to a constant, by weighted least squares.

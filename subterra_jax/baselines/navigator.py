@@ -53,8 +53,6 @@ def target_speed(mission: Mission, estimate: Station, obs: Observed, params: Env
     Args:
         mission: Progress in the task.
         estimate: Estimate of the station.
-        obs: The observation.
-        params: The task.
     """
     speed_max = jnp.asarray(params.vehicle.speed_max)
     if params.errand == "cover":
@@ -87,8 +85,6 @@ def search(
         mission: Mission, with the distance up to this observation.
         estimate: Estimate of the station; sure is one whose standard deviation is below half the task's tolerance.
         moved: Distance commanded since the last observation, m.
-        obs: The observation.
-        params: The task.
         sure_for: Distance over which the estimate must be sure, m.
     """
     is_sure = jnp.exp(estimate.log_sigma) < 0.5 * params.goal.tolerance

@@ -131,7 +131,6 @@ def particle_filter(params: EnvParams, n_particles: int | None = None) -> Naviga
     """Makes the filter with the steering and the mission of the other baselines.
 
     Args:
-        params: The task.
         n_particles: Number of particles. `None` is 256; 4,096 where the start may be anywhere, 1,024 where it is
             uncertain, and 512 where rails may be wet.
     """

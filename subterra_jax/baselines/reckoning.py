@@ -46,7 +46,6 @@ def reckon(
 
     Args:
         before: Dead reckoning before it.
-        obs: The observation.
         speed: Speed of the command before it, m/s.
         odometer_share: Weight of the odometer's distance, 1; the rest is the command's.
         period: Control period, s.

@@ -55,7 +55,6 @@ def move_pose(
     """Move poses along an axis.
 
     Args:
-        pose: The poses.
         distance: Distance of each, m.
         turned: Turn of all, rad; NaN is unknown, and replaced by that of the axis.
         curvature: Curvature of the axis at each, 1/m.

@@ -63,8 +63,6 @@ def listed_episodes(env: TunnelEnv, params: EnvParams, n: int = N_LISTED) -> Epi
     """Return the first `n` episodes of a task, evenly over severities and tunnels.
 
     Args:
-        env: The environment.
-        params: The task.
         n: Number of episodes, 1 to 500.
 
     Returns:

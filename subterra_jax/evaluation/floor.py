@@ -98,7 +98,6 @@ class _Errors:
     odometer, and what is added to that while facing falling stations.
 
     Args:
-        params: The task.
         stretch: Distance of one call of `drive`, m.
         start: Variance of the station of the start, m².
     """

@@ -29,7 +29,6 @@ def evaluate(
 
     Args:
         env: The environment; it need not have been made with `estimates`.
-        params: The task, not batched.
         agent: The agent that drives, or a policy from `load_policy`, whose params must be these.
         episodes: Episodes, from `listed_episodes`.
         batch: Episodes driven at the same time; memory and speed alone depend on it.
@@ -62,8 +61,6 @@ def fitting_batch(env: TunnelEnv, params: EnvParams, agent: Agent | DrivingPolic
 
     Args:
         env: The environment, as for `evaluate`.
-        params: The task, not batched.
-        agent: The agent that drives.
         most: Number of episodes to drive.
         gigabytes: Memory that driving may take beside params and agent, GB. One episode may take more.
     """

@@ -259,7 +259,6 @@ def add_step(tally: Tally, taken: Taken, tolerance: Float[Array, ""]) -> Tally:
 
     Args:
         tally: Sums so far.
-        taken: The step.
         tolerance: Error up to which an estimate counts as right, m.
     """
     info, estimate = taken.info, taken.action[2:4]

@@ -33,7 +33,6 @@ def require_file(path: Path, *endings: str) -> Path:
     """Checks that a file can be written, without leaving anything behind, and returns its path.
 
     Args:
-        path: The file.
         *endings: Endings that it may have; any where none is given.
 
     Raises:

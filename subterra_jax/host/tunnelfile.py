@@ -49,7 +49,6 @@ def write_tunnel(path: Path, facts: Mapping[str, Any], arrays: Mapping[str, np.n
     """Write a tunnel file; the same content gives the same bytes.
 
     Args:
-        path: File to write.
         facts: Words and single numbers by field, which are kept as they are.
         arrays: Numbers by field, which are rounded: radii to 0.1 mm, others to 1e-5 m or rad.
     """

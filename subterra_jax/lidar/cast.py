@@ -25,7 +25,6 @@ def nearest(
     """Distance at which each beam first meets a wall, m; `inf` where it meets none.
 
     Args:
-        tunnel: The tunnel.
         first: First block of the window.
         position: Origin of the beams, tunnel frame, m.
         direction: Their unit vectors; if their number is even, the second half must oppose the first.
@@ -34,19 +33,12 @@ def nearest(
 
 
 class _Found(NamedTuple):
-    """Nearest walls after some rounds of a search.
+    """Nearest walls after some rounds of a search."""
 
-    Attributes:
-        distance: To the nearest wall so far along each beam, m.
-        block: The block that it is of.
-        last: Key of the farthest box looked into, as `_entries` makes it.
-        open: A nearer wall may stand in a box not yet looked into.
-    """
-
-    distance: Float[Array, "n_beams"]
-    block: Int[Array, "n_beams"]
-    last: Int[Array, "n_beams"]
-    open: Bool[Array, "n_beams"]
+    distance: Float[Array, "n_beams"]  # to the nearest wall so far along each beam, m
+    block: Int[Array, "n_beams"]  # the block that it is of
+    last: Int[Array, "n_beams"]  # key of the farthest box looked into, as `_entries` makes it
+    open: Bool[Array, "n_beams"]  # a nearer wall may stand in a box not yet looked into
 
 
 def _search(

@@ -120,21 +120,14 @@ def _call(kernel: Any, grid: tuple[int, ...], size: int) -> Any:
 
 
 class _Visit(NamedTuple):
-    """Place of a thread on its way.
+    """Place of a thread on its way."""
 
-    Attributes:
-        block: Block that it visits.
-        way: 1.0 ahead, -1.0 behind.
-        state: What it does.
-        best: Distance of what it has met, m; its square for clearances, m².
-    """
+    block: Array  # block that it visits
+    way: Array  # 1.0 ahead, -1.0 behind
+    state: Array  # what it does
+    best: Array  # distance of what it has met, m; its square for clearances, m²
 
-    block: Any
-    way: Any
-    state: Any
-    best: Any
-
-    def onward(self, start: Any, enters: Any, ends: Any) -> _Visit:
+    def onward(self, start: Array, enters: Array, ends: Array) -> _Visit:
         """Return the next visit.
 
         Args:
@@ -151,7 +144,7 @@ class _Visit(NamedTuple):
             block=block, way=jnp.where(back, -1.0, self.way), state=jnp.where(visits, state, self.state)
         )
 
-    def left(self, best: Any) -> _Visit:
+    def left(self, best: Array) -> _Visit:
         """Return the visit after those that have entered their block have met what is in it."""
         entered = self.state == _ENTERED
         return self._replace(
@@ -162,17 +155,11 @@ class _Visit(NamedTuple):
 
 
 class _Beam(NamedTuple):
-    """The beams that threads cast.
+    """The beams that threads cast."""
 
-    Attributes:
-        number: Of each thread's beam.
-        d_x: Its direction.
-        d_y: The other coordinate.
-    """
-
-    number: Any
-    d_x: Any
-    d_y: Any
+    number: Array  # of each thread's beam
+    d_x: Array  # its direction
+    d_y: Array  # the other coordinate
 
 
 def _scan_kernel(

@@ -49,11 +49,9 @@ def scan(
     """True ranges of one scan: beam 0 straight ahead, the others counter-clockwise, evenly spaced over the whole turn.
 
     Args:
-        tunnel: The tunnel.
         position: Position of the LiDAR, tunnel frame, m.
         heading: Its heading, rad.
         station: Its station, m; chooses the window of walls.
-        params: The LiDAR.
         wanted: Someone will read the scan; where not, the ranges may be anything.
 
     Returns:

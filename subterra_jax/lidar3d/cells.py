@@ -34,22 +34,16 @@ _SHORTEST = 0.25  # m, of a block
 
 @dataclasses.dataclass(frozen=True)
 class Blocks:
-    """Straight blocks along the axis, each with its own frame.
+    """Straight blocks along the axis, each with its own frame."""
 
-    Attributes:
-        centre: Origin of each frame, exactly representable in float32, m, `(b, 3)`.
-        turn: Axes of the frame as rows: along, left, up, exactly representable in float32, `(b, 3, 3)`.
-        back: Plane where the block begins, in its own frame, as a unit normal along the axis and an offset:
-            inside, `normal · point >= offset`; m, `(b, 4)`.
-        front: Plane where the block ends; inside, `normal · point <= offset`; m, `(b, 4)`.
-        ends: Stations of the two planes, m, `(b, 2)`.
-    """
-
-    centre: Float[np.ndarray, "b 3"]
+    centre: Float[np.ndarray, "b 3"]  # origin of each frame, exactly representable in float32, m, `(b, 3)`
+    # axes of the frame as rows: along, left, up, exactly representable in float32, `(b, 3, 3)`
     turn: Float[np.ndarray, "b 3 3"]
+    # plane where the block begins, in its own frame, as a unit normal along the axis and an offset: inside, `normal ·
+    # point >= offset`; m, `(b, 4)`
     back: Float[np.ndarray, "b 4"]
-    front: Float[np.ndarray, "b 4"]
-    ends: Float[np.ndarray, "b 2"]
+    front: Float[np.ndarray, "b 4"]  # plane where the block ends; inside, `normal · point <= offset`; m, `(b, 4)`
+    ends: Float[np.ndarray, "b 2"]  # stations of the two planes, m, `(b, 2)`
 
 
 def cut_blocks(axis: Axis, length: float) -> Blocks:
@@ -84,38 +78,29 @@ def _as_float32(values: np.ndarray) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True)
 class Cells:
-    """Triangles sorted by cell, in the integers that the kernels read.
-
-    Attributes:
-        blocks: The blocks.
-        low: Least coordinate along the axis in each block's frame, m; the first cell begins there, `(b,)`.
-        pitch: Length of a cell along the axis, m.
-        unit: Units of the vertices' coordinates along and across the axis, m, `(2,)`.
-        prism: Distance of the faces of each block's empty prism from its axis, m, `(b, N_FACES)`.
-        cell: First entry of each cell; number of entries in the upper half of a word, and in the lower the least
-            distance from the axis in units of `NEAR_UNIT`, measured as `wedge_depth`; cells of a block by station and
-            then wedge, `(b * n_x * N_WEDGES, 2)`.
-        entry: Triangles of each cell: number of the first vertex in its block, and steps to the other two, `(e,)`.
-        first_vertex: First vertex of each block, `(b,)`.
-        vertex: Vertices, across and along the axis in the first word, upwards and along in the second, `(v, 2)`.
-        first_box: First box of each block, and the end of the last, `(b + 1,)`.
-        box: Three rows that turn a point of the block's frame into a box's, where its faces are at -1 and 1: factors
-            (1/m) and what to subtract, `(k, 12)`.
-        box_top: Upper end of each block's boxes in its frame, m, `(b,)`.
-    """
+    """Triangles sorted by cell, in the integers that the kernels read."""
 
     blocks: Blocks
+    # least coordinate along the axis in each block's frame, m; the first cell begins there, `(b,)`
     low: Float[np.ndarray, b]
-    pitch: float
-    unit: Float[np.ndarray, 2]
+    pitch: float  # length of a cell along the axis, m
+    unit: Float[np.ndarray, 2]  # units of the vertices' coordinates along and across the axis, m, `(2,)`
+    # distance of the faces of each block's empty prism from its axis, m, `(b, N_FACES)`
     prism: Float[np.ndarray, "b n_faces"]
+    # first entry of each cell; number of entries in the upper half of a word, and in the lower the least distance from
+    # the axis in units of `NEAR_UNIT`, measured as `wedge_depth`; cells of a block by station and then wedge, `(b * n_x
+    # * N_WEDGES, 2)`
     cell: Int[np.ndarray, "c 2"]
+    # triangles of each cell: number of the first vertex in its block, and steps to the other two, `(e,)`
     entry: Int[np.ndarray, e]
-    first_vertex: Int[np.ndarray, b]
+    first_vertex: Int[np.ndarray, b]  # first vertex of each block, `(b,)`
+    # vertices, across and along the axis in the first word, upwards and along in the second, `(v, 2)`
     vertex: Int[np.ndarray, "v 2"]
-    first_box: Int[np.ndarray, b1]
+    first_box: Int[np.ndarray, b1]  # first box of each block, and the end of the last, `(b + 1,)`
+    # three rows that turn a point of the block's frame into a box's, where its faces are at -1 and 1: factors (1/m) and
+    # what to subtract, `(k, 12)`
     box: Float[np.ndarray, "k 12"]
-    box_top: Float[np.ndarray, b]
+    box_top: Float[np.ndarray, b]  # upper end of each block's boxes in its frame, m, `(b,)`
 
 
 class _TooDense(Exception):
@@ -126,8 +111,6 @@ def sort_triangles(axis: Axis, surface: Triangles, block_length: float, n_x: int
     """Sort the triangles of a surface into cells around an axis.
 
     Args:
-        axis: The axis.
-        surface: The triangles.
         block_length: Target length of a block, m; halved until every block can number its triangles.
         n_x: Cells of a block along the axis.
 

@@ -56,8 +56,6 @@ def add_noise(
     Args:
         ranges: True ranges, m.
         cosine: Cosine of incidence, 0 to 1.
-        normal: Standard normal numbers.
-        params: The LiDAR.
     """
     slant = jnp.clip(cosine, 1e-3, 1.0)
     tangent = jnp.minimum(jnp.sqrt(1.0 - slant * slant) / slant, STEEPEST)
@@ -84,8 +82,6 @@ def returns(
         ranges: True ranges, m.
         cosine: Cosine of incidence, 0 to 1.
         reflectivity: Reflectivity of what is met.
-        uniform: Uniform numbers.
-        params: The LiDAR.
     """
     echo = reflectivity * jnp.maximum(cosine, 1e-6) / jnp.maximum(ranges * ranges, 1e-6)
     weakest = jnp.maximum(params.weakest, 1e-12)
@@ -120,7 +116,6 @@ def mix(
         other: Ranges of rays on their rims, m.
         off_plane: Distance of the rim's end from the plane that the middle meets, m.
         uniform: Uniform numbers: which beams, and where between.
-        params: The LiDAR.
     """
     step = other - ranges
     edge = (jnp.abs(step) < PULSE) & (jnp.abs(off_plane) > EDGE_STEP) & (uniform[:, 0] < params.mixed)

@@ -8,7 +8,6 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from subterra_jax.compiled import in_32_bits
-from subterra_jax.host.errors import SubterraError
 from subterra_jax.lidar import nvidia
 from subterra_jax.lidar.kernels import compiled_by_numba, fastest
 from subterra_jax.lidar3d import fused
@@ -19,28 +18,6 @@ from subterra_jax.rows import rowwise
 
 # Rays that XLA marches in step: each takes as long as the one with most to do.
 IN_STEP = 256
-# Memory of a ray, bytes: origin, direction, block, limit, distance, entry, block again, each once more as a row.
-_BYTES = 2 * 4 * 11
-
-
-def device_memory() -> int | None:
-    """Return the memory of the device, bytes; `None` where it does not tell."""
-    stats = jax.devices()[0].memory_stats()
-    return None if stats is None else stats.get("bytes_limit")
-
-
-def _require_memory(n: int) -> None:
-    """Check that rays fit into the device's memory.
-
-    Raises:
-        SubterraError: They do not.
-    """
-    limit = device_memory()
-    if limit is not None and n * _BYTES > limit:
-        raise SubterraError(
-            f"{n:,} rays need {n * _BYTES / 1e9:.3g} GB and the device has {limit / 1e9:.3g} GB: cast at most "
-            f"{limit // _BYTES:,} at once"
-        )
 
 
 def tools_of(relief: Relief) -> Tools:
@@ -102,7 +79,6 @@ def _one(relief: Relief, *row: Array) -> tuple[Hits, Point]:
 @in_32_bits()
 def _many(relief: Relief, *rows: Array) -> tuple[Hits, Point]:
     """`by_xla` by the fastest means at hand."""
-    _require_memory(len(rows[2]))
     return fastest(by_xla, fused.find, by_numba)(relief, *rows)
 
 
@@ -122,7 +98,6 @@ def _images(relief: Relief, origins: Array, directions: Array, blocks: Array, li
     apart = jax.vmap(_image, (None, 0, 0, 0, 0))
     if not nvidia.present() or directions.shape[1] * directions.shape[2] % fused.ROWS:
         return apart(relief, origins, directions, blocks, limits)
-    _require_memory(directions.size // 3)
     rows = origins, directions, blocks, limits
     return fastest(apart, fused.find, apart)(relief, *rows)
 

@@ -19,19 +19,12 @@ _TINY = 1e-12
 
 
 class Rays(NamedTuple):
-    """Rays on their way through blocks.
+    """Rays on their way through blocks."""
 
-    Attributes:
-        block: Present block.
-        reached: Distance at which the ray enters it, m.
-        hits: First triangles met so far.
-        going: The ray may still meet a nearer one.
-    """
-
-    block: Int[Array, "n"]
-    reached: Float[Array, "n"]
-    hits: Hits
-    going: Bool[Array, "n"]
+    block: Int[Array, "n"]  # present block
+    reached: Float[Array, "n"]  # distance at which the ray enters it, m
+    hits: Hits  # first triangles met so far
+    going: Bool[Array, "n"]  # the ray may still meet a nearer one
 
 
 def march(
@@ -71,37 +64,21 @@ def _cross_block(tools: Tools, n_x: int, origin: Point, direction: Point, limit:
 
 
 class Way(NamedTuple):
-    """Ways of rays through one block each, in its frame; distances are from the rays' origins if not said otherwise.
+    """Ways of rays through one block each, in its frame; distances are from the rays' origins if not said otherwise."""
 
-    Attributes:
-        at: Points where the rays leave the empty prism, m.
-        d: Unit vectors.
-        begin: Distance to these points, m.
-        end: Distance from there to where the ray leaves the block, or needs go no further, m.
-        leave: Distance at which the ray leaves the block, m.
-        following: Block behind or ahead that it enters then; -1 at a mouth.
-        hits: First triangles or boxes met so far, those in earlier blocks and the boxes of this one.
-        low: Coordinate along the axis at which the first cell begins, m.
-        per_cell: Cells a metre.
-        along: Units of a vertex along the axis, 1/m.
-        across: Units of a vertex across the axis, 1/m.
-        first_vertex: First vertex of the block.
-        first_cell: First cell of the block.
-    """
-
-    at: tuple[Array, ...]
-    d: tuple[Array, ...]
-    begin: Float[Array, "n"]
-    end: Float[Array, "n"]
-    leave: Float[Array, "n"]
-    following: Int[Array, "n"]
-    hits: Hits
-    low: Float[Array, "n"]
-    per_cell: Float[Array, "n"]
-    along: Float[Array, "n"]
-    across: Float[Array, "n"]
-    first_vertex: Int[Array, "n"]
-    first_cell: Int[Array, "n"]
+    at: tuple[Array, ...]  # points where the rays leave the empty prism, m
+    d: tuple[Array, ...]  # unit vectors
+    begin: Float[Array, "n"]  # distance to these points, m
+    end: Float[Array, "n"]  # distance from there to where the ray leaves the block, or needs go no further, m
+    leave: Float[Array, "n"]  # distance at which the ray leaves the block, m
+    following: Int[Array, "n"]  # block behind or ahead that it enters then; -1 at a mouth
+    hits: Hits  # first triangles or boxes met so far, those in earlier blocks and the boxes of this one
+    low: Float[Array, "n"]  # coordinate along the axis at which the first cell begins, m
+    per_cell: Float[Array, "n"]  # cells a metre
+    along: Float[Array, "n"]  # units of a vertex along the axis, 1/m
+    across: Float[Array, "n"]  # units of a vertex across the axis, 1/m
+    first_vertex: Int[Array, "n"]  # first vertex of the block
+    first_cell: Int[Array, "n"]  # first cell of the block
 
 
 def _enter_block(tools: Tools, origin: Point, direction: Point, limit: Array, rays: Rays) -> Way:
@@ -126,21 +103,9 @@ def _enter_block(tools: Tools, origin: Point, direction: Point, limit: Array, ra
     begin = jnp.minimum(rays.reached + leap, jnp.maximum(leave, rays.reached))
     at = [tools.fma(begin - rays.reached, d[i], at[i]) for i in range(3)]
     end = jnp.minimum(jnp.minimum(leave, limit), hits.distance) - begin
-    return Way(
-        tuple(at),
-        tuple(d),
-        begin,
-        end,
-        leave,
-        following,
-        hits,
-        frame(20),
-        frame(21),
-        frame(22),
-        frame(23),
-        link(2),
-        link(3),
-    )
+    low, per_cell, along, across = (frame(i) for i in range(20, 24))
+    units = low, per_cell, along, across, link(2), link(3)
+    return Way(tuple(at), tuple(d), begin, end, leave, following, hits, *units)
 
 
 def _nearer(one: Hits, other: Hits) -> Hits:

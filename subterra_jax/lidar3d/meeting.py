@@ -22,18 +22,13 @@ Point = tuple[Array, Array, Array]
 
 
 class Tools(NamedTuple):
-    """Operations that a kernel does in its own way.
+    """Operations that a kernel does in its own way."""
 
-    Attributes:
-        load: Reads elements of `frame`, `link`, `entry` or `box` of a relief, each flat, or pairs of `cell` or
-            `vertex`, by name and index; zeros where a mask is given and false.
-        fma: a · b + c.
-        reciprocal: 1 / a, to within the last bit.
-    """
-
+    # reads elements of `frame`, `link`, `entry` or `box` of a relief, each flat, or pairs of `cell` or `vertex`, by
+    # name and index; zeros where a mask is given and false
     load: Callable[..., Any]
-    fma: Callable[[Array, Any, Any], Array]
-    reciprocal: Callable[[Array], Array]
+    fma: Callable[[Array, Any, Any], Array]  # a · b + c
+    reciprocal: Callable[[Array], Array]  # 1 / a, to within the last bit
 
     def dot(self, a: Any, b: Any) -> Array:
         """Return the scalar product of two vectors of two or three components."""
@@ -53,37 +48,22 @@ class Tools(NamedTuple):
 
 
 class Hits(NamedTuple):
-    """First triangles that rays meet.
+    """First triangles that rays meet."""
 
-    Attributes:
-        distance: Distance to it, m; `inf` where there is none.
-        entry: Its entry in `Relief.entry`; -1 where there is none, and -2 less the number of a box.
-        block: Block of that entry.
-    """
-
-    distance: Float[Array, "n"]
-    entry: Int[Array, "n"]
-    block: Int[Array, "n"]
+    distance: Float[Array, "n"]  # distance to it, m; `inf` where there is none
+    entry: Int[Array, "n"]  # its entry in `Relief.entry`; -1 where there is none, and -2 less the number of a box
+    block: Int[Array, "n"]  # block of that entry
 
 
 class Ray(NamedTuple):
-    """Rays among the cells of their blocks.
+    """Rays among the cells of their blocks."""
 
-    Attributes:
-        units: Points where they begin, in units of the relief along the axis, and a `FINE` part of them across it.
-        speeds: Changes of these over a metre.
-        x: Places along the axis where they begin, in cells from the first.
-        slope: Metres that they go for each cell along the axis.
-        forward: 1 for rays along the axis, 0 for those against it.
-        onward: True for rays that turn to the next wedge, not to the one before.
-    """
-
-    units: Point
-    speeds: Point
-    x: Float[Array, "n"]
-    slope: Float[Array, "n"]
-    forward: Int[Array, "n"]
-    onward: Bool[Array, "n"]
+    units: Point  # points where they begin, in units of the relief along the axis, and a `FINE` part of them across it
+    speeds: Point  # changes of these over a metre
+    x: Float[Array, "n"]  # places along the axis where they begin, in cells from the first
+    slope: Float[Array, "n"]  # metres that they go for each cell along the axis
+    forward: Int[Array, "n"]  # 1 for rays along the axis, 0 for those against it
+    onward: Bool[Array, "n"]  # true for rays that turn to the next wedge, not to the one before
 
 
 def meet_one(

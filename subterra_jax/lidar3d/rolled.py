@@ -26,7 +26,6 @@ def raise_shell(shell: Shell, lining: str) -> tuple[Axis, Triangles]:
     """Return the axis and the surface of one variant: wall with recesses, track, furniture.
 
     Args:
-        shell: The bore.
         lining: Name of the variant.
 
     Raises:
@@ -91,15 +90,10 @@ def _raise_wall(shell: Shell, lining: ShellLining) -> Triangles:
 
 @dataclass(frozen=True)
 class _Unrolled:
-    """The section's arc length as a coordinate, cut open at a seam.
+    """The section's arc length as a coordinate, cut open at a seam."""
 
-    Attributes:
-        around: Arc length from the seam at each of `angle`, m.
-        angle: Angles over one turn from the seam, rad, growing.
-    """
-
-    around: Float[np.ndarray, " k"]
-    angle: Float[np.ndarray, " k"]
+    around: Float[np.ndarray, " k"]  # arc length from the seam at each of `angle`, m
+    angle: Float[np.ndarray, " k"]  # angles over one turn from the seam, rad, growing
 
     @property
     def girth(self) -> float:
@@ -118,21 +112,13 @@ class _Unrolled:
 
 @dataclass(frozen=True)
 class _Sheet:
-    """Triangles in the plane.
+    """Triangles in the plane."""
 
-    Attributes:
-        around: Arc length of each point, m.
-        station: Station of each point, m.
-        recess: Number of the recess that a point belongs to, -1 for none.
-        rim: True for points on the rim of their recess.
-        faces: Rows of three points.
-    """
-
-    around: Float[np.ndarray, " p"]
-    station: Float[np.ndarray, " p"]
-    recess: Int[np.ndarray, " p"]
-    rim: Bool[np.ndarray, " p"]
-    faces: Int[np.ndarray, "f 3"]
+    around: Float[np.ndarray, " p"]  # arc length of each point, m
+    station: Float[np.ndarray, " p"]  # station of each point, m
+    recess: Int[np.ndarray, " p"]  # number of the recess that a point belongs to, -1 for none
+    rim: Bool[np.ndarray, " p"]  # true for points on the rim of their recess
+    faces: Int[np.ndarray, "f 3"]  # rows of three points
 
 
 def _unroll(shell: Shell, seam: float) -> _Unrolled:
@@ -232,19 +218,12 @@ def _triangulate(
 
 
 class _Grid(NamedTuple):
-    """Points in rows by station, every second row half a step aside, and one of each row on every fold.
+    """Points in rows by station, every second row half a step aside, and one of each row on every fold."""
 
-    Attributes:
-        around: Arc length of each point, m.
-        station: Its station, m.
-        node: Row times columns plus column; -1 of points on folds.
-        shape: Rows and columns.
-    """
-
-    around: Float[np.ndarray, " p"]
-    station: Float[np.ndarray, " p"]
-    node: Int[np.ndarray, " p"]
-    shape: tuple[int, int]
+    around: Float[np.ndarray, " p"]  # arc length of each point, m
+    station: Float[np.ndarray, " p"]  # its station, m
+    node: Int[np.ndarray, " p"]  # row times columns plus column; -1 of points on folds
+    shape: tuple[int, int]  # rows and columns
 
 
 def _grid(girth: float, length: float, fold: np.ndarray, spacing: tuple[float, float]) -> _Grid:

@@ -20,14 +20,10 @@ Rows = tuple[Array, Array, Array]
 
 @struct.dataclass
 class Space:
-    """Surface and ground of a tunnel or of a stack of tunnels, beside the planar `Tunnel`.
+    """Surface and ground of a tunnel or of a stack of tunnels, beside the planar `Tunnel`."""
 
-    Attributes:
-        relief: The surface.
-        ground: Height of the ground (m) and its rise along the axis (m/m) at each node of the tunnel's `grid`.
-    """
-
-    relief: Relief
+    relief: Relief  # the surface
+    # height of the ground (m) and its rise along the axis (m/m) at each node of the tunnel's `grid`
     ground: Float[Array, "all_nodes 2"]
 
     @classmethod
@@ -35,7 +31,6 @@ class Space:
         """Put the bore of a plan on the device; takes some seconds per kilometre.
 
         Args:
-            plan: The tunnel.
             lining: Variant of its walls; `None` is `pockets`, or the first if there is none of that name.
 
         Raises:

@@ -12,17 +12,11 @@ BOX_CORNERS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1
 
 @dataclasses.dataclass(frozen=True)
 class Axis:
-    """The centreline of a bore.
+    """The centreline of a bore."""
 
-    Attributes:
-        station: Uniform stations from 0, m, `(n,)`.
-        position: Positions, m, `(n, 3)`.
-        tangent: Unit vectors of growing station, `(n, 3)`.
-    """
-
-    station: Float[np.ndarray, "n"]
-    position: Float[np.ndarray, "n 3"]
-    tangent: Float[np.ndarray, "n 3"]
+    station: Float[np.ndarray, "n"]  # uniform stations from 0, m, `(n,)`
+    position: Float[np.ndarray, "n 3"]  # positions, m, `(n, 3)`
+    tangent: Float[np.ndarray, "n 3"]  # unit vectors of growing station, `(n, 3)`
 
 
 @dataclasses.dataclass(frozen=True)

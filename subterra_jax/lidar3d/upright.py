@@ -19,7 +19,6 @@ def raise_walls(plan: TunnelPlan, lining: str | None = None, crown: float = CROW
     Level beams at the LiDAR's height meet what the planar LiDAR meets; pockets and furniture reach from floor to crown.
 
     Args:
-        plan: The tunnel.
         lining: Variant of its walls; `None` is `pockets`, or the first if there is none of that name.
         crown: Height of the crown above the ground, m.
 

@@ -56,7 +56,6 @@ def _call(name: str, work: Any, chunk: int, results: Any, *arguments: Any) -> An
     """Call a kernel.
 
     Args:
-        name: Its name.
         work: As for `handler_of`.
         chunk: Fewest rows of a thread: some 50 µs of work, or starting it does not pay.
         results: Shapes and types of its results.

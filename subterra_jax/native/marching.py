@@ -132,8 +132,6 @@ def _cross_cells(numbers, first_vertex, first_cell, cell, entry, vertex, n_x, p,
 
     Args:
         numbers: Numbers of the block from the least place along the axis on, see `N_FRAME`.
-        first_vertex: Its first vertex.
-        first_cell: Its first cell.
         cell: The relief's cells; `entry` and `vertex` as well.
         entry: Entries.
         vertex: Vertices.

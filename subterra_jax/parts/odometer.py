@@ -92,7 +92,6 @@ def advance_odometry(
     """Add the measured motion of one step.
 
     Args:
-        state: The odometer before.
         motion: True speed (m/s) and yaw rate (rad/s) during the step.
         period: Duration of the step, s.
         noise: Standard normal numbers: distance, heading, then the wandering error if any.

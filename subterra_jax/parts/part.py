@@ -147,7 +147,6 @@ class Part(abc.ABC):
         Args:
             key: A key of the part's own; `(len(streams),)` keys where it has several streams.
             batch: Leading axes of every array returned.
-            params: The task.
         """
         return ()
 
@@ -163,9 +162,7 @@ class Part(abc.ABC):
         """Make the part's state at the start of an episode.
 
         Args:
-            draw: Its numbers from `draw_reset`.
             state: The robot at its start, with the states of the parts before this one.
-            params: The task.
         """
         return ()
 
@@ -207,10 +204,6 @@ class Part(abc.ABC):
 
     def check(self, others: frozenset[str], params: EnvParams) -> None:
         """Refuse params that the part cannot honour, or parts that it does not go with.
-
-        Args:
-            others: Names of all parts.
-            params: The task.
 
         Raises:
             ValueError: It cannot.
@@ -270,9 +263,5 @@ class Motion(Part):
         """Move the robot for one control period.
 
         Args:
-            state: State before.
             drive: The clipped command as the other parts have changed it.
-            noise: Numbers from `draw_step`.
-            tunnel: Tunnel that the robot is in.
-            params: The task.
         """

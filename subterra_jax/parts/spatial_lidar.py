@@ -240,7 +240,6 @@ class SpatialLidar(Part):
             own: State of the part.
             sight: Moment that is shown.
             uniform: Numbers for the sides of the rims; read where pixels are mixed.
-            params: The task.
         """
         sensor = params.lidar
         origins, rays = self.poses(own, sight, params)

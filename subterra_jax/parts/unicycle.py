@@ -41,7 +41,6 @@ def clip_action(action: Float[Array, "2"], params: VehicleParams) -> Float[Array
 
     Args:
         action: Wanted forward speed (m/s) and yaw rate (rad/s, counter-clockwise); anything at all.
-        params: The limits.
     """
     limit = jnp.stack([params.speed_max, params.yaw_rate_max])
     floor = jnp.stack([jnp.zeros_like(limit[0]), -limit[1]])
@@ -81,7 +80,6 @@ def clearance(tunnel: Tunnel, position: Float[Array, "2"], station: Float[Array,
     """Measure the distance from a point to the nearest wall or furniture segment.
 
     Args:
-        tunnel: The tunnel.
         position: The point, tunnel frame, m.
         station: Its station, m.
 
@@ -161,10 +159,8 @@ def in_contact(
     cannot pass through a wall unseen. Leaving through a mouth counts as contact, because no wall goes on there.
 
     Args:
-        tunnel: The tunnel.
         clear: Distance from the middle of the robot to the nearest obstacle, m.
         station: Station of the robot, m.
-        params: The robot.
     """
     outside = (station < -params.radius) | (station > tunnel.length + params.radius)
     return (clear < params.radius) | outside

@@ -31,10 +31,7 @@ def advance_wander(
     """Return the value a distance further on; unchanged where nothing was travelled.
 
     Args:
-        value: The value before.
         travelled: Distance, m; its sign does not matter.
-        noise: A standard normal number.
-        params: The process.
 
     Source: Gillespie 1996, Exact numerical simulation of the Ornstein-Uhlenbeck process.
     """

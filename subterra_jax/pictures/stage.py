@@ -53,7 +53,6 @@ def stage_spec(piece: Piece, *, leave_out: tuple[str, ...] = ()) -> mujoco.MjSpe
     """Return the model of a piece: its surfaces in the tunnel frame, lamps below the crown and fog.
 
     Args:
-        piece: The piece.
         leave_out: Names of surfaces to leave out.
 
     Raises:

@@ -40,7 +40,6 @@ def tunnel_surfaces(plan: TunnelPlan, lining: str | None, start: float, end: flo
     they stand upright below a level crown of an assumed height.
 
     Args:
-        plan: The tunnel.
         lining: Variant of its walls; `None` is the default one.
         start: First station, m; clipped to the tunnel.
         end: Last station, m; clipped to the tunnel.
@@ -80,7 +79,6 @@ def short_shell(shell: Shell, start: float, end: float) -> Shell:
     Its triangles are not exactly those of the whole, and it is much quicker to triangulate.
 
     Args:
-        shell: The bore.
         start: First station on the shell's own axis, m.
         end: Last station, m.
     """

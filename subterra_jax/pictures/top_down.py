@@ -19,7 +19,6 @@ def wall_points(tunnel: Tunnel, first: int, step: float = 0.04) -> np.ndarray:
     """Points along the walls that a LiDAR can see.
 
     Args:
-        tunnel: The tunnel.
         first: First block of the window, an entry of `tunnel.scan_first`.
         step: Largest distance between points, m.
 

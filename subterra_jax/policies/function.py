@@ -39,7 +39,6 @@ class Policy(Protocol):
         """Returns the action of one control period, as the environment takes it, and the memory after it.
 
         Args:
-            obs: Observation.
             memory: Memory so far.
             state: State of the environment. Only the oracle, and agents in a stack of tunnels, have to be given it.
         """

@@ -82,9 +82,7 @@ def look(
 
     Args:
         now: Reckoning, with this observation.
-        obs: The observation.
         way: Distance still to drive, m, reckoned or estimated.
-        params: The task.
         relief: Show what a memory can add up: how far each beam ends beyond the wall beside the robot, the phase of
             the rings, and how far the commands are ahead of the odometer.
     """

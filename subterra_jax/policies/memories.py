@@ -105,7 +105,6 @@ class Memory:
             kept: What is kept.
             command: The command, m/s and rad/s.
             obs: The observation that it answers; not needed where a localiser estimates the station.
-            params: The task.
         """
         station, log_sigma, direction = self._estimate(kept, obs, params)
         return jnp.stack([station + direction * command[0] * params.vehicle.period, log_sigma, direction])

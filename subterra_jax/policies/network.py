@@ -178,7 +178,6 @@ def act(actor: Weights, x: Float[Array, "*batch n"]) -> Float[Array, "*batch act
 
     Args:
         actor: Weights of a `Perceptron`, layers by name.
-        x: Its inputs.
     """
     hidden = [actor[f"hidden_{i}"]["bias"].shape[0] for i in range(len(actor) - 1)]
     widths = (*hidden, actor["out"]["bias"].shape[0])

@@ -43,8 +43,6 @@ def open_agent(source: Any, env: TunnelEnv, params: EnvParams) -> Agent:
         source: A baseline by name; a trained policy as for `policy_source`; `module:Class` or `FILE.py:Class`; or an
             agent. A class, or a function that makes an agent, is called with the task's params where it has a parameter
             without a default.
-        env: The environment.
-        params: Its params.
 
     Raises:
         AgentError: There is no such agent, or it lacks part of the contract.

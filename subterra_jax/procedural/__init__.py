@@ -11,7 +11,6 @@ import re
 import numpy as np
 
 from subterra_jax.host.errors import TunnelError
-from subterra_jax.host.loading import load_module
 from subterra_jax.host.texture import texture_seed
 from subterra_jax.procedural import open_world
 from subterra_jax.procedural.geometry import Alignment
@@ -22,8 +21,8 @@ __all__ = ["GENERATED", "control", "default_lining", "expand", "generate", "open
 NAME = "control"
 LININGS = ("smooth",)
 _LENGTH, _RADIUS, _HALF_WIDTH, _LIDAR_HEIGHT, _STEP = 351.0, 300.0, 2.825, 0.7, 0.25  # m
-GENERATED = re.compile(rf"{NAME}|(?:(.+):)?(open:.*)")  # before `open:`, a user's module that adds a kind
-_SEVERAL = re.compile(r"((?:.+:)?open:[a-z:-]+):(\d+)-(\d+)")
+GENERATED = re.compile(rf"{NAME}|open:.*")
+_SEVERAL = re.compile(r"(open:[a-z:-]+):(\d+)-(\d+)")
 
 
 def expand(name: str) -> list[str]:
@@ -50,17 +49,14 @@ def generate(name: str, linings: tuple[str, ...] | None = None, solid: bool = Fa
     """Generate a tunnel by its name.
 
     Args:
-        name: `control`, `open:SPLIT:INDEX` or `open:KIND:SPLIT:INDEX`; `FILE.py:open:KIND:SPLIT:INDEX` first runs a
-            user's file, which registers the kind.
+        name: `control`, `open:SPLIT:INDEX` or `open:KIND:SPLIT:INDEX`.
         linings: Variants to make; `None` for all.
         solid: Make the bore in three dimensions too; `control` has none.
 
     Raises:
         TunnelError: There is no such tunnel, or it lacks a lining.
-        UserCodeError: The user's file cannot be run.
     """
-    match = GENERATED.fullmatch(name)
-    if match is None:
+    if GENERATED.fullmatch(name) is None:
         raise TunnelError(
             f"no tunnel {name!r}; a generated one is called {NAME}, open:SPLIT:INDEX or open:KIND:SPLIT:INDEX"
         )
@@ -69,9 +65,7 @@ def generate(name: str, linings: tuple[str, ...] | None = None, solid: bool = Fa
         raise TunnelError(f"tunnel {name!r} has no lining {missing[0]!r}; it has {', '.join(there)}")
     if name == NAME:
         return control()
-    if match[1]:
-        load_module(match[1])
-    return open_world.plan(match[2], variants=linings or there, solid=solid)
+    return open_world.plan(name, variants=linings or there, solid=solid)
 
 
 def control() -> TunnelPlan:

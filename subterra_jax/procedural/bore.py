@@ -79,7 +79,6 @@ def draw_bore(kind: Kind, length: float, items: tuple[str, ...], seeds: list[np.
     """Draw a bore.
 
     Args:
-        kind: Its kind.
         length: Length, m.
         items: Furniture that it has.
         seeds: Random generators of section, surface, pockets, furniture and mount, so that none moves another.

@@ -25,7 +25,6 @@ def plane_walls(bore: Bore, smooth: bool = False) -> Cut:
     """Return the cut of the wall, without pockets and fixtures.
 
     Args:
-        bore: The bore.
         smooth: Leave out all relief.
 
     Returns:
@@ -56,8 +55,6 @@ def cut_lining(bore: Bore, alignment: Alignment, variant: str, rough: Cut) -> Li
     Walkways whose top is above the plane are the wall there. A vertex is left out where the wall stays within 1 mm.
 
     Args:
-        bore: The bore.
-        alignment: Its centreline.
         variant: `built`, `bare` (without furniture) or `smooth` (design section).
         rough: Result of `plane_walls`.
     """

@@ -132,7 +132,6 @@ def draw_boxes(
     """Draw boxes and niches of some items.
 
     Args:
-        rng: Source of randomness.
         items: Names in `FIXTURES`; what comes first keeps its place, and what would overlap it is left out.
         section: Design section.
         shift: Lateral of its middle line, m.
@@ -187,7 +186,6 @@ def overlaps(
     """Return which rectangles on the walls overlap one of the boxes.
 
     Args:
-        boxes: The boxes.
         side: Wall of each rectangle, 1 left, -1 right.
         start: Station where it begins, m.
         end: Station where it ends, m.

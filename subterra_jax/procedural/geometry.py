@@ -83,7 +83,6 @@ def draw_alignment(rng: np.random.Generator, length: float, ranges: LineRanges) 
     """Draw a centreline of bends and straights that stays clear of itself.
 
     Args:
-        rng: Source of randomness.
         length: Length, m.
         ranges: Ranges of its bends and straights.
 
@@ -141,7 +140,6 @@ def wander(
     """Draw a smooth random line along the tunnel: Gaussian, with covariance `sd² exp(−d² / correlation²)`.
 
     Args:
-        rng: Source of randomness.
         station: Stations of the result, m, growing.
         sd: Standard deviation, in the unit of the result.
         correlation: Correlation length, m.

@@ -16,11 +16,6 @@ Sources, by the letter that stands behind a range:
 from __future__ import annotations
 
 import dataclasses
-import re
-import zlib
-from typing import Any
-
-import numpy as np
 
 Range = tuple[float, float]
 
@@ -111,19 +106,6 @@ class Kind:
     patches: PatchRanges | None = None  # patches, if any
     fixtures: tuple[str, ...] = ()  # furniture that may be drawn, by name
     always: tuple[str, ...] = ()  # furniture that belongs to the lining itself
-
-    def draw_relief(self, rng: np.random.Generator, length: float, half_width: float) -> list[Any]:
-        """Draw relief of the kind's own, which the ranges do not describe; by default none.
-
-        Args:
-            rng: Source of randomness.
-            length: Length of the tunnel, m.
-            half_width: Half the largest width of the section, m.
-
-        Returns:
-            Layers (`subterra_jax.procedural.surfaces.Layer`), which are added to those of the ranges.
-        """
-        return []
 
 
 _METRO = SectionRanges(width=(5.2, 6.0), fill=(0.7, 1.1))  # A; fill M
@@ -250,34 +232,3 @@ LENGTH: Range = (300.0, 3000.0)  # m, drawn uniformly in its logarithm
 MOUNT_HEIGHT: Range = (0.4, 1.2)  # m above the floor
 MOUNT_LATERAL: Range = (-0.3, 0.3)  # m to the left of the robot's middle
 MOUNT_TILT = 0.02  # rad, standard deviation of roll and of pitch, cut at three
-
-_OWN: dict[str, Kind] = {}  # kinds of users, which no split of the benchmark has
-
-
-def register_kind(kind: Kind) -> None:
-    """Add a kind of lining of one's own: `open:NAME:SPLIT:INDEX` are its tunnels, in every split.
-
-    The benchmark stays as it is: `open:SPLIT:INDEX`, without a kind, never draws it. Adding it again replaces it.
-
-    Raises:
-        ValueError: The benchmark has a kind of that name, the name is not of small letters, or there is no such
-            furniture.
-    """
-    if kind.name in KINDS:
-        raise ValueError(f"{kind.name!r} is a kind of the benchmark; register yours under another name")
-    if not re.fullmatch("[a-z]+", kind.name):
-        raise ValueError(f"a kind's name must be of small letters, got {kind.name!r}")
-    known = {*FIXTURES, *BENCHES}
-    if unknown := {*kind.fixtures, *kind.always} - known:
-        raise ValueError(f"kind {kind.name!r}: no furniture {min(unknown)!r}; there are {', '.join(sorted(known))}")
-    _OWN[kind.name] = kind
-
-
-def all_kinds() -> dict[str, Kind]:
-    """Return the kinds of the benchmark, then those of users, by name."""
-    return {**KINDS, **_OWN}
-
-
-def kind_number(name: str) -> int:
-    """Return the number of a kind from which the seeds of its tunnels are made."""
-    return list(KINDS).index(name) if name in KINDS else zlib.crc32(name.encode()) | 1 << 31

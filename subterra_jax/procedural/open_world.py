@@ -27,8 +27,6 @@ from subterra_jax.procedural.kinds import (
     MOUNT_HEIGHT,
     MOUNT_LATERAL,
     MOUNT_TILT,
-    all_kinds,
-    kind_number,
 )
 from subterra_jax.procedural.solid import make_shell
 from subterra_jax.tunnel.plan import TunnelPlan
@@ -113,7 +111,7 @@ def draw(name: str, length: float | None = None) -> Drawn:
     """
     kind, split, index = _parse(name)
     rng = _generators(kind, split, index)
-    ranges = all_kinds()[kind]
+    ranges = KINDS[kind]
     level = str(rng["items"].choice(levels_of(kind, split)))
     share = {"none": 0.0, "some": _HALF, "all": 1.0}[level]
     items = tuple(item for item in ranges.fixtures if rng["items"].random() < share)
@@ -129,7 +127,7 @@ def draw(name: str, length: float | None = None) -> Drawn:
 
 def _generators(kind: str, split: str, index: int) -> dict[str, np.random.Generator]:
     """Return the random generators of a tunnel by what they draw, so that none moves another."""
-    sequence = np.random.SeedSequence([_FAMILY, kind_number(kind), SPLITS[split] + index])
+    sequence = np.random.SeedSequence([_FAMILY, list(KINDS).index(kind), SPLITS[split] + index])
     return dict(zip(_STREAMS, (np.random.default_rng(child) for child in sequence.spawn(len(_STREAMS))), strict=True))
 
 
@@ -194,7 +192,7 @@ def _half_width(bore: Bore, station: np.ndarray, rough: Cut) -> np.ndarray:
 
 
 def in_benchmark(name: str) -> bool:
-    """Tell whether a name is of a tunnel that the benchmark's own kinds make, whatever a user has registered."""
+    """Tell whether a name is of a tunnel of the open world."""
     match = _NAME.fullmatch(name)
     return match is not None and (match[1] is None or match[1] in KINDS)
 
@@ -205,16 +203,16 @@ def _parse(name: str) -> tuple[str, str, int]:
     if match is None:
         raise TunnelError(
             f"no tunnel {name!r}; one of the open world is called open:SPLIT:INDEX or open:KIND:SPLIT:INDEX, as in "
-            f"open:cast:val:7; kinds are {', '.join(all_kinds())}, splits {', '.join(SPLITS)}"
+            f"open:cast:val:7; kinds are {', '.join(KINDS)}, splits {', '.join(SPLITS)}"
         )
     kind, split, index = match[1], match[2], int(match[3])
-    if kind is not None and kind not in (known := all_kinds()):
-        raise TunnelError(f"no tunnel {name!r}: there is no kind {kind!r}; there are {', '.join(known)}")
+    if kind is not None and kind not in KINDS:
+        raise TunnelError(f"no tunnel {name!r}: there is no kind {kind!r}; there are {', '.join(KINDS)}")
     if split not in SPLITS:
         raise TunnelError(f"no tunnel {name!r}: there is no split {split!r}; there are {', '.join(SPLITS)}")
     if index >= SPLIT_SIZE:
         raise TunnelError(f"no tunnel {name!r}: split {split!r} has tunnels 0 to {SPLIT_SIZE - 1}")
     there = kinds_of(split)
-    if kind in KINDS and kind not in there:
+    if kind is not None and kind not in there:
         raise TunnelError(f"no tunnel {name!r}: {kind!r} is in {UNSEEN} alone; {split!r} has {', '.join(there)}")
     return kind or there[index % len(there)], split, index

@@ -21,7 +21,6 @@ def make_shell(
     """Return the bore in three dimensions, with the linings of a plan.
 
     Args:
-        bore: The bore.
         alignment: Its centreline in plan.
         elevation: Height of the floor at the centreline's stations, m.
         variants: Of `built`, `bare` and `smooth`.

@@ -175,8 +175,6 @@ def draw_layers(
     """Draw the relief of a kind of lining.
 
     Args:
-        rng: Source of randomness.
-        kind: The kind.
         length: Length of the tunnel, m.
         radius: Half its width, m.
         around: Girth of its section, m.
@@ -193,4 +191,4 @@ def draw_layers(
     fine = float(np.exp(rng.uniform(*np.log(surface.fine_length))))
     layers.append(Waves.draw(rng, float(rng.uniform(*surface.fine_sd)), fine))
     layers.append(Waves.draw(rng, float(rng.uniform(*surface.coarse_sd)), float(rng.uniform(*surface.coarse_length))))
-    return [*layers, *kind.draw_relief(rng, length, radius)]
+    return layers

@@ -32,12 +32,7 @@ class Poses:
 
 
 def true_poses(trace: Trace, plan: TunnelPlan) -> Poses:
-    """Return the poses of `base_link` in the tunnel frame: on the track, pitched by its grade, never rolled.
-
-    Args:
-        trace: The episode.
-        plan: Its tunnel.
-    """
+    """Return the poses of `base_link` in the tunnel frame: on the track, pitched by its grade, never rolled."""
     state = trace.state
     station = np.asarray(state.station, np.float64)
     tangent = np.stack([np.interp(station, plan.station, plan.tangent[:, i]) for i in range(2)], axis=-1)
@@ -58,7 +53,6 @@ def reckoned_poses(trace: Trace, reading: Float[np.ndarray, "n 2"]) -> Poses:
     """Return the poses of `base_link` in `odom`: the odometer's distance (m) along its heading (rad), level.
 
     Args:
-        trace: The episode.
         reading: Odometer as observed by the agent, with the task's delay.
     """
     place, heading = reckon(reading)

@@ -63,7 +63,6 @@ def drive(
     Args:
         env: The environment; it need not have been made with `estimates`. Legs must be simulated by MuJoCo itself.
         params: The task in one tunnel.
-        agent: The agent that drives.
         seed: Seed of everything random.
         severity: Severity of the faults; drawn where it is left out.
         steps: Steps at most; the task's horizon if left out.

@@ -180,7 +180,6 @@ def draw_stations(
 
     Args:
         draw: Uniform numbers in [0, 1): of the distance, and of the start.
-        tunnel: The tunnel.
         goal: Bounds of the distance, and the least distance from a mouth.
     """
     room = jnp.maximum(tunnel.length - 2.0 * goal.margin, 0.0)
@@ -212,7 +211,6 @@ def goal_terms(
     """Return the terms of one step's reward in a task with a goal.
 
     Args:
-        step: The step.
         params: The task, with the weights.
         success: The task was achieved at this step.
         stopped: The robot has come to a stop, right or wrong.

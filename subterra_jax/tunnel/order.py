@@ -44,7 +44,6 @@ def order(plan: TunnelPlan, blocks: Blocks, first: np.ndarray, count: np.ndarray
 
     Args:
         plan: The tunnel, for its station grid.
-        blocks: Its blocks.
         first: First block within reach of each node, as from `windows`.
         count: Number of blocks from there on that may be within reach.
     """
@@ -87,7 +86,6 @@ def windows(plan: TunnelPlan, blocks: Blocks, reach: float) -> tuple[np.ndarray,
 
     Args:
         plan: The tunnel, for its station grid.
-        blocks: Its blocks.
         reach: Distance that the window must cover, m, wherever across the tunnel the robot is and up to half a grid
             step along it; beyond a mouth, up to 0.5 m outside.
 
@@ -124,7 +122,6 @@ def _within(
         middle: Middle of each box, m.
         half: Half the long axis of each box, m.
         thickness: Half the thickness of each box, m.
-        blocks: The blocks.
         limit: Distance for each box, m.
 
     Returns:

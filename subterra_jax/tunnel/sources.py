@@ -50,8 +50,7 @@ def load_tunnel(path: str | Path | None = None, *, solid: bool = False) -> Tunne
 
     Args:
         path: The file; the name of a packaged tunnel (`subterra-351`, `metro`); `control`, the bore without
-            landmarks; `open:SPLIT:INDEX` or `open:KIND:SPLIT:INDEX`, one of the open world, after `FILE.py:` where a
-            user's file registers the kind. `None` is the first packaged one.
+            landmarks; `open:SPLIT:INDEX` or `open:KIND:SPLIT:INDEX` of the open world. `None`: the first packaged.
         solid: Give a tunnel of the open world its shell too, the bore in three dimensions; a file that has one always
             comes with it.
 

@@ -126,7 +126,6 @@ class Tunnel:
         """Put a plan on the device.
 
         Args:
-            plan: The tunnel.
             lining: Variant of its walls; `None` is `pockets`, or the first if there is none of that name.
             reach: Largest LiDAR range, m.
             block_length: Target length of the blocks of wall, m; affects speed alone.
@@ -228,7 +227,6 @@ def foot(tunnel: Tunnel, position: Float[Array, "2"], near: Float[Array, ""]) ->
     """Return the foot of the perpendicular from a point to the centreline, searched near a known station.
 
     Args:
-        tunnel: The tunnel.
         position: The point, tunnel frame, m.
         near: A station within about half a metre of the answer, m, such as the previous one.
 

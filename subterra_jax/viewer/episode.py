@@ -27,33 +27,20 @@ _NO_LINES = np.zeros((0, 2, 3))
 
 @dataclasses.dataclass(frozen=True)
 class Drawn:
-    """An episode to draw. Row k of a series is the moment after k periods.
+    """An episode to draw. Row k of a series is the moment after k periods."""
 
-    Attributes:
-        centreline: Its tunnel.
-        trace: The episode.
-        goal: Station of the goal, m; NaN without one.
-        truth: True positions on the ground, m.
-        heading: True headings, rad, unwrapped.
-        reckoned: Positions on the ground by the odometer alone, m.
-        reckoned_heading: Headings by the odometer alone, rad.
-        odometer_error: Distance by the odometer less the way driven, m.
-        estimate: Estimated station and its standard deviation, m; NaN without an estimate, and in row 0.
-        hits: Returns of the LiDAR, robot's frame on the ground, m; NaN without a return.
-        boxes: Obstacles: middle x, y, unit vector along the first side, half sides, m.
-    """
-
-    centreline: Centreline
-    trace: Trace
-    goal: float
-    truth: Float[np.ndarray, "t 3"]
-    heading: Float[np.ndarray, "t"]
-    reckoned: Float[np.ndarray, "t 3"]
-    reckoned_heading: Float[np.ndarray, "t"]
-    odometer_error: Float[np.ndarray, "t"]
+    centreline: Centreline  # its tunnel
+    trace: Trace  # the episode
+    goal: float  # station of the goal, m; NaN without one
+    truth: Float[np.ndarray, "t 3"]  # true positions on the ground, m
+    heading: Float[np.ndarray, "t"]  # true headings, rad, unwrapped
+    reckoned: Float[np.ndarray, "t 3"]  # positions on the ground by the odometer alone, m
+    reckoned_heading: Float[np.ndarray, "t"]  # headings by the odometer alone, rad
+    odometer_error: Float[np.ndarray, "t"]  # distance by the odometer less the way driven, m
+    # estimated station and its standard deviation, m; NaN without an estimate, and in row 0
     estimate: Float[np.ndarray, "t 2"]
-    hits: Float[np.ndarray, "t p 3"]
-    boxes: Float[np.ndarray, "b 6"]
+    hits: Float[np.ndarray, "t p 3"]  # returns of the LiDAR, robot's frame on the ground, m; NaN without a return
+    boxes: Float[np.ndarray, "b 6"]  # obstacles: middle x, y, unit vector along the first side, half sides, m
 
     def __len__(self) -> int:
         return len(self.truth)
@@ -115,7 +102,6 @@ def draw(env: TunnelEnv, params: EnvParams, plan: TunnelPlan, trace: Trace) -> D
         env: The environment that it was driven in.
         params: The task, in one tunnel.
         plan: That tunnel.
-        trace: The episode.
     """
     centreline, state, fields = Centreline(plan), trace.state, env.fields(params)
     heading, station = np.unwrap(np.asarray(state.heading, np.float64)), np.asarray(state.station, np.float64)

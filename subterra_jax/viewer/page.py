@@ -43,7 +43,6 @@ def write_page(path: Path, drawn: Drawn, shapes: list[Shape], radius: float, fac
 
     Args:
         path: The HTML file; it holds everything and needs no server.
-        drawn: The episode.
         shapes: Surfaces of its tunnel.
         radius: Radius of the robot's footprint, m.
         facts: Words about it, as `task` and `driver`, for the panel.
