@@ -206,6 +206,18 @@ def test_a_batch_of_robots_uses_the_kernel_where_there_is_an_nvidia_gpu(
             assert ("triton" in for_nvidia(measure, tunnel, *one)) is there
 
 
+def test_a_step_of_a_batch_launches_two_kernels_of_ours_and_draws_in_three_calls(plan, monkeypatch):
+    """One scan for observations before and after resets, one clearance; draws of a step: one for each kind."""
+    env, params = st.make("Subterra/Faulted-v1", tunnel=plan, lining="smooth")
+    state = jax.eval_shape(lambda key: st.AutoReset(env).reset(key, params, 32)[1], jax.random.key(0))
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(nvidia, "present", lambda: True)
+    text = for_nvidia(st.AutoReset(env).step, jax.random.key(0), state, jnp.zeros((32, 2)), params)
+    assert text.count("triton") == 2
+    draws = jax.make_jaxpr(lambda key: env.draw_step(key, (32,), params))(jax.random.key(0))
+    assert str(draws).count("random_bits[") == 2
+
+
 def test_a_range_that_is_no_number_is_wrong(plan: st.TunnelPlan) -> None:
     poses = reference.random_poses(plan, 4, np.random.default_rng(6))
     assert reference.agreement(plan.lining("pockets").segments, poses, np.full((4, 16), np.nan)).n_wrong == 64

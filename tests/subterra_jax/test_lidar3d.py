@@ -211,7 +211,6 @@ def test_scans_of_one_place_meet_what_rays_of_a_place_each_meet(reliefs):
 def test_the_kernel_for_scans_lowers_for_a_gpu_and_serves_a_batch(reliefs, monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(nvidia, "present", lambda: True)
-    monkeypatch.setattr(finding, "device_memory", lambda: None)
 
     def ranges(relief, origin, way, station):
         meet = jax.vmap(casting.meet, (None, 0, None, 0, None))
