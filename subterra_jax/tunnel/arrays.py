@@ -20,7 +20,6 @@ ArrayLike = Any  # a number, an array or nested lists of numbers
 ROBOT_RADIUS = 0.4  # m, of `VehicleParams`
 _SPACING = 0.25  # m, of the station grid
 _UNEVEN = 5.0  # m: a smooth wall is the median over this length, so that pockets do not move it
-_OFF = 0.1  # m, tolerance between given half widths and walls
 _BACK = 1.0  # m, that a wall may run backwards, as in the corner of a niche
 _SHORT = 3.0  # m, that a wall may end before or behind a mouth, as in a skew portal
 
@@ -30,7 +29,6 @@ def from_centreline(
     half_width: ArrayLike,
     *,
     pockets: ArrayLike = (),
-    tangent: ArrayLike | None = None,
     name: str = "from arrays",
     elevation: ArrayLike = 0.0,
     lidar_height: float = 0.6,
@@ -43,7 +41,6 @@ def from_centreline(
             lines, so give a bend about one vertex per metre.
         half_width: Distance from the centreline to either wall, m, one number or `(n,)`.
         pockets: Rows of station of the middle (m), side (1 left, -1 right), length (m) and depth (m), `(p, 4)`.
-        tangent: Unit tangents at the vertices, `(n, 2)`; computed if `None`.
         name: Name of the tunnel.
         elevation: Height of the ground, m, one number or `(n,)`.
         lidar_height: Height of the LiDAR plane above the ground, m.
@@ -55,7 +52,7 @@ def from_centreline(
     Raises:
         TunnelError: An array is malformed, or the tunnel cannot be driven; see `docs/guide`.
     """
-    plan = _bare_plan(xy, half_width, tangent, name, elevation, lidar_height, ring_pitch)
+    plan = _bare_plan(xy, half_width, name, elevation, lidar_height, ring_pitch)
     distance = {side: plan.half_width for side in (1.0, -1.0)}
     linings = {"smooth": _offset_lining(plan, {side: (plan.station, plan.half_width) for side in distance})}
     rows = _numbers("pockets", np.reshape(pockets, (0, 4)) if np.size(pockets) == 0 else pockets, (None, 4))
@@ -75,8 +72,6 @@ def from_polylines(
     right: ArrayLike,
     *,
     centreline: ArrayLike | None = None,
-    half_width: ArrayLike | None = None,
-    tangent: ArrayLike | None = None,
     furniture: ArrayLike = (),
     lining: str = "smooth",
     name: str = "from arrays",
@@ -90,9 +85,6 @@ def from_polylines(
         left: Vertices of the left wall in the direction of growing station, m, `(k, 2)`; pockets and niches included.
         right: Vertices of the right wall in the same direction, m, `(m, 2)`.
         centreline: Vertices of the centreline, m, `(n, 2)`; the line midway between the walls if `None`.
-        half_width: Half the distance between the walls at the centreline's vertices, m, one number or `(n,)`; measured
-            if `None`.
-        tangent: Unit tangents at the centreline's vertices, `(n, 2)`; computed if `None`.
         furniture: Further wall segments `x0, y0, x1, y1`, m, `(f, 4)`.
         lining: Name of this variant of the walls.
         name: Name of the tunnel.
@@ -109,18 +101,8 @@ def from_polylines(
             raise TunnelError(f"{side} needs at least 2 vertices, got {len(vertex)}")
     extra = _numbers("furniture", np.reshape(furniture, (0, 4)) if np.size(furniture) == 0 else furniture, (None, 4))
     xy = _midline(walls["left"], walls["right"]) if centreline is None else centreline
-    plan = _bare_plan(xy, 1.0 if half_width is None else half_width, tangent, name, elevation, lidar_height, ring_pitch)
-    measured = _half_widths(plan, walls)
-    if half_width is None:
-        plan.half_width[:] = measured
-    else:
-        off = measured - plan.half_width
-        at = int(np.argmin(off)) if off.min() < -_OFF else int(np.argmax(off))
-        if off.min() < -_OFF or np.median(off) > _OFF:
-            raise TunnelError(
-                f"half_width does not meet the walls: at station {plan.station[at]:.1f} m it is "
-                f"{plan.half_width[at]:.2f} m, and the walls are {measured[at]:.2f} m from the centreline"
-            )
+    plan = _bare_plan(xy, 1.0, name, elevation, lidar_height, ring_pitch)
+    plan.half_width[:] = _half_widths(plan, walls)
     plan.linings[lining] = Lining(_wall(plan, "left", walls["left"]), _wall(plan, "right", walls["right"]), extra)
     return _check_drivable(plan)
 
@@ -182,7 +164,6 @@ def _per_vertex(name: str, values: ArrayLike, n: int) -> Float[np.ndarray, " n"]
 def _bare_plan(
     xy: ArrayLike,
     half_width: ArrayLike,
-    tangent: ArrayLike | None,
     name: str,
     elevation: ArrayLike,
     lidar_height: float,
@@ -206,7 +187,7 @@ def _bare_plan(
         return np.stack([np.interp(station, at, column) for column in values.T], axis=-1)
 
     centre = along(vertex)
-    directions = np.gradient(centre, axis=0) if tangent is None else along(_unit_tangent(tangent, vertex))
+    directions = np.gradient(centre, axis=0)
     return TunnelPlan(
         name=name,
         provenance="simulated",
@@ -233,19 +214,6 @@ def _distances_along(vertex: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"
         corner = int(np.argmax(back)) + 1
         raise TunnelError(f"centreline doubles back at index {corner}, or has a corner of 90 degrees there")
     return np.concatenate([[0.0], np.cumsum(size)])
-
-
-def _unit_tangent(tangent: ArrayLike, vertex: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-    """Return the unit tangent at each vertex, refused where it points against the centreline."""
-    given, step = _numbers("tangent", tangent, (None, 2)), np.diff(vertex, axis=0)
-    if len(given) != len(vertex):
-        raise TunnelError(f"tangent has {len(given)} values, the centreline {len(vertex)} vertices")
-    if np.any(np.abs(np.linalg.norm(given, axis=1) - 1.0) > 1e-3):
-        raise TunnelError("tangent must hold unit vectors")
-    against = np.minimum(np.sum(given[:-1] * step, axis=1), np.sum(given[1:] * step, axis=1)) <= 0.0
-    if np.any(against):
-        raise TunnelError(f"tangent is flipped at index {int(np.argmax(against))}: it points against the centreline")
-    return given
 
 
 def _offset_lining(plan: TunnelPlan, distances: dict[float, tuple[np.ndarray, np.ndarray]]) -> Lining:

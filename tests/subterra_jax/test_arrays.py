@@ -114,7 +114,6 @@ def test_the_robot_is_as_wide_as_the_vehicle():
     assert VehicleParams().radius == ROBOT_RADIUS
 
 
-TANGENT = np.tile([1.0, 0.0], (len(LINE), 1))
 ACROSS = [[60.0, -2.5, 60.0, 2.5]]
 WALL_ACROSS = np.concatenate([LEFT[:60], [[60.0, -1.0]], LEFT[61:]])
 NARROW = np.concatenate([LEFT[:60], [[60.0, 0.3]], LEFT[61:]])
@@ -124,14 +123,9 @@ RING = 20.0 * np.column_stack([np.cos(np.linspace(0.0, 7.0, 200)), np.sin(np.lin
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: st.tunnel.from_centreline(LINE, 2.5, tangent=-TANGENT), "tangent is flipped at index 0"),
-        (lambda: st.tunnel.from_centreline(LINE, 2.5, tangent=TANGENT[1:]), "tangent has 120 values, the centreline"),
-        (lambda: st.tunnel.from_centreline(LINE, 2.5, tangent=2.0 * TANGENT), "unit vectors"),
         (lambda: st.tunnel.from_polylines(RIGHT, LEFT), "left and right are swapped"),
         (lambda: st.tunnel.from_polylines(RIGHT, LEFT, centreline=LINE), "left and right are swapped"),
         (lambda: st.tunnel.from_polylines(LEFT, RIGHT[::-1]), "run in opposite directions"),
-        (lambda: st.tunnel.from_polylines(LEFT, RIGHT, centreline=LINE, half_width=3.0), "half_width does not meet"),
-        (lambda: st.tunnel.from_polylines(LEFT, RIGHT, centreline=LINE, half_width=2.0), "half_width does not meet"),
         (lambda: st.tunnel.from_polylines(LEFT[:60], RIGHT, centreline=LINE), "left goes from station 0.0 to 59.0 m"),
         (lambda: st.tunnel.from_polylines(LEFT, RIGHT + 4.0 * ASIDE), "left and right are swapped"),
         (lambda: st.tunnel.from_polylines(LEFT, RIGHT, centreline=LINE + 4.0 * ASIDE), "not beside the centreline"),
