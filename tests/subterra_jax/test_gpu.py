@@ -206,9 +206,9 @@ def test_a_batch_of_robots_uses_the_kernel_where_there_is_an_nvidia_gpu(
             assert ("triton" in for_nvidia(measure, tunnel, *one)) is there
 
 
-def test_a_step_of_a_batch_launches_two_kernels_of_ours_and_draws_in_three_calls(plan, monkeypatch):
+def test_a_step_of_a_batch_launches_two_kernels_of_ours_and_draws_in_two_calls(monkeypatch):
     """One scan for observations before and after resets, one clearance; draws of a step: one for each kind."""
-    env, params = st.make("Subterra/Faulted-v1", tunnel=plan, lining="smooth")
+    env, params = st.make("Subterra/Faulted-v1", tunnel="control")
     state = jax.eval_shape(lambda key: st.AutoReset(env).reset(key, params, 32)[1], jax.random.key(0))
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(nvidia, "present", lambda: True)
