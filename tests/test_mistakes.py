@@ -156,6 +156,7 @@ MISTAKES = {
     "benchmarks.b2_traverse --coverage nan": "coverage must be above 0 and at most 1, got nan",
     "benchmarks.b2_traverse --policy Traverse-v1": "which is no gait",
     "benchmarks.b2_traverse --out empty": "empty: is a folder, not a file",
+    "benchmarks.rewrite none.bag --out o": "none.bag: cannot be read",
     "benchmarks.recordings --count 0 --out o": "count must be at least 1, got 0",
     "benchmarks.draw scene none": "none",
     "benchmarks.draw scene tunnel --width -5": "width must be at least 1, got -5",

@@ -13,11 +13,11 @@ from jaxtyping import Bool, Float, Int
 from benchmarks.fidelity.files import FidelityError, file_hash
 from scene.poses.trajectory import load_tum
 from scene.reading.recording import Recording
-from scene.reading.scans import POINTCLOUD2_TYPE, make_scan
-from scene.reading.times import TIME_FIELDS, Scan
+from scene.reading.scans import POINTCLOUD2_TYPE, cloud_records
+from scene.reading.source import stack_xyz
+from scene.reading.times import Scan, make_scan, time_field
 
 SILENT_RANGE = 1e6  # m: where the point of a beam without return is put, in its direction
-_FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _FEWEST_RETURNS = 8  # returns of a ring or column that tell its direction
 
 
@@ -27,9 +27,9 @@ def is_organised(recording: Recording) -> bool:
     A Livox message keeps a place for them too, but nothing in it gives their direction.
     """
     for message in _messages(recording):
-        names = {field.name for field in message.fields}
         whole = message.height * message.width * message.point_step == len(message.data)
-        return bool(whole and message.height > 1 and message.width > 1 and names & set(TIME_FIELDS))
+        timed = time_field(field.name for field in message.fields)[0] is not None
+        return bool(whole and message.height > 1 and message.width > 1 and timed)
     return False
 
 
@@ -83,7 +83,8 @@ def beam_directions(
 
 def _messages(recording: Recording) -> Iterator[Any]:
     asked = (recording.topic, POINTCLOUD2_TYPE)
-    connections = [c for c in recording.reader.connections if (c.topic, c.msgtype) == asked]
+    known = recording.reader.connections if recording.reader else ()
+    connections = [c for c in known if (c.topic, c.msgtype) == asked]
     if not connections:
         return
     for _, _, raw in recording.reader.messages(connections=connections):
@@ -91,20 +92,14 @@ def _messages(recording: Recording) -> Iterator[Any]:
 
 
 def _read_fields(message: Any) -> tuple[Float[np.ndarray, "rings columns 3"], Int[np.ndarray, "rings columns"], str]:
-    order = ">" if message.is_bigendian else "<"
-    fields = {
-        f.name: (order + _FIELD_TYPES[f.datatype], f.offset) for f in message.fields if f.datatype in _FIELD_TYPES
-    }
-    name = next(time for time in TIME_FIELDS if time in fields)
-    names = ["x", "y", "z", name]
-    layout = np.dtype({
-        "names": names, "formats": [fields[n][0] for n in names], "offsets": [fields[n][1] for n in names],
-        "itemsize": message.point_step,
-    })  # fmt: skip
     if message.height * message.width * message.point_step != len(message.data):
         raise ValueError(f"a sweep of {message.height} x {message.width} points in {len(message.data)} bytes")
-    rows = np.frombuffer(np.asarray(message.data, np.uint8).tobytes(), layout).reshape(message.height, message.width)
-    return np.stack([rows[axis] for axis in "xyz"], axis=-1).astype(float), rows[name], name
+    rows = cloud_records(message)
+    name, _ = time_field(rows.dtype.names or ())
+    if name is None:
+        raise ValueError("a sweep whose points have no times")
+    shape = (message.height, message.width)
+    return stack_xyz(rows).reshape(*shape, 3), rows[name].reshape(shape), name
 
 
 def _wrap(angle: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:

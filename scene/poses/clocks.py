@@ -59,8 +59,8 @@ def lidar_turns(recording: Recording) -> LidarTurns | None:
     for _ in range(_PASSES):
         tracker, times = Tracker(), list[float]()
         for scan in scans:
-            first = float(scan.times.min())  # the first beams may have met nothing
-            scan = Scan(scan.stamp + first, scan.points, scan.times - first)
+            begin = float(scan.times.min())  # the first beams may have met nothing
+            scan = Scan(scan.stamp + begin, scan.points, scan.times - begin)
             middle = scan.stamp + 0.5 * float(scan.times.max())
             if not times or middle > times[-1]:
                 tracker.register(scan, middle, guide)
@@ -91,11 +91,14 @@ def turns_of_poses(poses: Trajectory) -> Turns:
     return rates
 
 
-def find_lag(lidar: LidarTurns, other: Turns) -> float | None:
-    """Return how much later the other clock shows the turns of the LiDAR, s; `None` where the turns do not tell."""
+def find_lag(lidar: LidarTurns, other: Turns) -> tuple[float | None, float]:
+    """Return how much later the other clock shows the turns of the LiDAR, s, and the correlation of the turns then.
+
+    The lag is `None` where the turns do not tell; the correlation is NaN where the LiDAR hardly turns.
+    """
     own = _even(lidar.rate)
     if float(np.linalg.norm(own, axis=1).mean()) < _LIVELY:
-        return None
+        return None, np.nan
 
     def agree(lag: float) -> float:
         return _agreement(own, _even(other(lidar.start + lag, lidar.end + lag)))
@@ -104,9 +107,9 @@ def find_lag(lidar: LidarTurns, other: Turns) -> float | None:
     best = max(near + _STEP * np.arange(-4, 5), key=agree)
     before, here, after = (agree(best + side) for side in (-_STEP, 0.0, _STEP))
     if here < _AGREE or abs(best) >= _REACH:
-        return None
+        return None, here
     bend = before - 2.0 * here + after
-    return float(best + (0.5 * _STEP * (before - after) / bend if bend < 0 else 0.0))
+    return float(best + (0.5 * _STEP * (before - after) / bend if bend < 0 else 0.0)), here
 
 
 def _even(rate: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3"]:
@@ -133,6 +136,7 @@ class Clock:
     of: str  # Whose clock: a topic, or the trajectory
     offset: float | None  # By which it is later than the LiDAR's, s; `None` where the turns do not tell
     corrected: bool = False  # True where it was set right
+    agreement: float = np.nan  # Correlation of its turns with the LiDAR's; NaN where nobody knows
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -161,28 +165,27 @@ def settle(recording: Recording, other: Timed, auto: bool) -> tuple[Clock, Timed
     else:
         of, turns = f"the trajectory {other.path.name}", turns_of_poses(other)
     apart = _apart(recording, of, other.times, auto)
-    lag = _lag(recording, lambda start, end: turns(start + apart, end + apart))
+    lag, agreement = _lag(recording, lambda start, end: turns(start + apart, end + apart))
     offset = None if lag is None and not apart else apart + (lag or 0.0)
     if offset is None or abs(offset) < NOTICED:
-        return Clock(of, offset), other
-    return Clock(of, offset, auto), replace(other, times=other.times - offset)
+        return Clock(of, offset, agreement=agreement), other
+    return Clock(of, offset, auto, agreement), replace(other, times=other.times - offset)
 
 
-def _lag(recording: Recording, other: Turns) -> float | None:
-    """Return the lag of another clock, s; `None` where the turns do not tell.
+def _lag(recording: Recording, other: Turns) -> tuple[float | None, float]:
+    """Return the lag of another clock, s, `None` where the turns do not tell, and their correlation.
 
     Where nothing told whether a header is of the start or the end of its sweep, and the other clock is early by the
     length of a sweep, the headers are of the end.
     """
-    lidar = lidar_turns(recording)
-    lag = None if lidar is None else find_lag(lidar, other)
-    times = recording.convention
+    lidar, times = lidar_turns(recording), recording.convention
+    lag, agreement = (None, np.nan) if lidar is None else find_lag(lidar, other)
     if lag is None or not times.guessed or times.length < 2 * NOTICED or abs(lag + times.length) > 3 * NOTICED:
-        return lag
+        return lag, agreement
     recording.take_end()
     print(f"point times {recording.facts['point_times']}", flush=True)
     lidar = lidar_turns(recording)
-    return None if lidar is None else find_lag(lidar, other)
+    return (None, np.nan) if lidar is None else find_lag(lidar, other)
 
 
 def _apart(recording: Recording, of: str, times: Float[np.ndarray, " n"], auto: bool) -> float:

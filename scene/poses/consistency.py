@@ -2,11 +2,10 @@
 
 The thickness of walls in sweeps put together is compared with that in single sweeps. Where it is larger, likely
 mistakes are undone one by one: another order of the quaternion, clocks apart, a mount turned. The one that makes the
-walls thin is named. Besides the median the thickest fifth counts: a mount that is off in pitch slides upright walls
-along themselves, and blurs only what of floor and crown a sensor sees.
+walls thin is named. A mount that is off in pitch slides upright walls along themselves, and blurs only what of floor
+and crown a sensor sees: so a turn that makes these much thinner is a mistake, too.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -26,12 +25,13 @@ _POINTS = 2500  # of each sweep
 _QUERIES, _NEIGHBOURS = 300, 16  # points of a scan that are looked at, and points about each that tell a wall
 _LONGEST = 25.0  # m; returns further away are far apart
 _BLURRED, _LEAST = 1.3, 0.012  # times the thickness in a sweep, and m, from which walls count as blurred
-_THICKEST, _WORSE, _LEAST_WORSE = 0.8, 1.35, 0.015  # quantile; the same limits for the thickest fifth
+_LEVEL, _FEW_LEVEL = 0.8, 20  # upright part of the normals of floor and crown; fewer queries there tell nothing
+_TILTED = 0.75  # share of the thickness of floor and crown below which a turn that brings them there is a mistake
 _EXPLAINS = 0.7  # a mistake that is named brings the thickness below this share
 _MIN_GAIN = 0.004  # m
 _SHIFTS = (0.05, 0.1, 0.2, 0.3, 0.5, 1.0)  # s
 _TURNS = (1.0, 2.0, 3.0, 5.0)  # deg
-_AXES = ("roll", "pitch", "yaw")
+_AXES = {"x": "roll", "y": "pitch", "z": "yaw"}
 
 
 @dataclass(frozen=True)
@@ -40,24 +40,20 @@ class PoseCheck:
 
     thickness: float  # Of walls in several sweeps together, m, standard deviation
     expected: float  # Of walls in single sweeps, m
-    upper: float  # That which a fifth of the places of several sweeps exceeds, m
-    upper_expected: float  # The same of single sweeps, m
+    level: float = np.nan  # Of floor and crown in several sweeps, m; NaN where too little of them is seen
+    level_best: float = np.nan  # The same with the LiDAR turned as makes it thinnest, m
     cause: str = ""  # The mistake that explains the difference, in words; empty where none was found
     wxyz: bool = False  # True where the quaternions are in the order w, x, y, z
 
     @property
     def blurred(self) -> bool:
-        """True where the poses make the walls thicker than the scanner does."""
-        return self._mostly or self.upper > max(_WORSE * self.upper_expected, _LEAST_WORSE)
+        """True where the poses make walls, or floor and crown, thicker than the scanner does."""
+        return self.upright or self.level_best < min(_TILTED * self.level, self.level - _MIN_GAIN)
 
     @property
-    def _mostly(self) -> bool:
+    def upright(self) -> bool:
+        """True where walls of any direction are too thick."""
         return self.thickness > max(_BLURRED * self.expected, _LEAST)
-
-    @property
-    def compared(self) -> tuple[float, float]:
-        """Thickness that tells, in several sweeps and in single ones, m: the median, or else the thickest fifth."""
-        return (self.thickness, self.expected) if self._mostly else (self.upper, self.upper_expected)
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -69,9 +65,12 @@ class PoseCheck:
         if not self.blurred:
             return None
         likely = self.cause or "the poses, their clock or the mount of the LiDAR may be wrong"
-        here, expected = (f"{1000 * value:.0f} mm" for value in self.compared)
-        part = "" if self._mostly else " in the thickest fifth"
-        return f"the poses blur the walls: {here} thick{part} where a single sweep has {expected}; {likely}"
+        what, here, other, when = (
+            ("the walls", self.thickness, self.expected, "where a single sweep has")
+            if self.upright
+            else ("floor and crown", self.level, self.level_best, "and could have")
+        )
+        return f"the poses blur {what}: {1000 * here:.0f} mm thick {when} {1000 * other:.0f} mm; {likely}"
 
 
 def check_poses(recording: Recording, trajectory: Trajectory, orders: bool = True) -> PoseCheck | None:
@@ -93,9 +92,33 @@ def check_poses(recording: Recording, trajectory: Trajectory, orders: bool = Tru
     def thickness(poses: Trajectory, turn: Rotation | None = None, single: bool = False) -> tuple[float, float]:
         return _measure(places, poses, turn, single)
 
-    (expected, upper_expected), (given, upper) = thickness(trajectory, single=True), thickness(trajectory)
-    check = PoseCheck(given, expected, upper, upper_expected)
-    return _find_cause(check, trajectory, thickness, orders) if check.blurred else check
+    (expected, _), (given, level) = thickness(trajectory, single=True), thickness(trajectory)
+    turned = {mount: thickness(trajectory, Rotation.from_euler(*mount, degrees=True)) for mount in _mounts()}
+    tilted = min((mount for mount in turned if mount[0] != "z"), key=lambda mount: turned[mount][1])
+    check = PoseCheck(given, expected, level, turned[tilted][1])
+    if not check.blurred:
+        return check
+    limit = min(_EXPLAINS * given, given - _MIN_GAIN)
+    found = [(np.inf, "", False)]
+    if orders:
+        found.append((thickness(reorder(trajectory))[0], "the quaternions are in the order w, x, y, z", True))
+    for shift in (sign * size for size in _SHIFTS for sign in (1, -1)):
+        side = "later" if shift > 0 else "earlier"
+        words = f"with the poses {abs(shift):g} s {side} they are thin: two clocks differ"
+        found.append((thickness(replace(trajectory, times=trajectory.times + shift))[0], words, False))
+    found += [(thick, _describe_mount(mount), False) for mount, (thick, _) in turned.items()]
+    best, words, wxyz = min(found, key=lambda row: row[0])
+    if best <= limit:
+        return replace(check, cause=words, wxyz=wxyz)
+    return check if check.upright else replace(check, cause=_describe_mount(tilted))
+
+
+def _mounts() -> list[tuple[str, float]]:
+    return [(axis, sign * size) for axis in _AXES for size in _TURNS for sign in (1, -1)]
+
+
+def _describe_mount(mount: tuple[str, float]) -> str:
+    return f"with the LiDAR turned by {mount[1]:+g}° in {_AXES[mount[0]]} they are thin: the extrinsic is off"
 
 
 def reorder(trajectory: Trajectory) -> Trajectory:
@@ -123,49 +146,25 @@ def _usable(scan: Scan, trajectory: Trajectory) -> bool:
 
 
 def _measure(places: list[list[Scan]], poses: Trajectory, turn: Rotation | None, single: bool) -> tuple[float, float]:
-    """Median thickness of the walls and that of the thickest fifth, m: in each sweep alone, or in all of a place."""
+    """Median thickness of all walls, and of floor and crown, m: in each sweep alone, or in all of a place."""
     result = []
     for group in places:
         clouds = [
             deskew(scan if turn is None else Scan(scan.stamp, turn.apply(scan.points), scan.times), poses)
             for scan in group
         ]
-        if single:
-            result.append(np.concatenate([_thickness(cloud, _QUERIES // len(clouds)) for cloud in clouds]))
-        else:
-            result.append(_thickness(np.concatenate(clouds), _QUERIES))
-    middle, upper = np.quantile(np.concatenate(result), [0.5, _THICKEST])
-    return float(middle), float(upper)
+        result += [_thickness(cloud, _QUERIES // len(clouds)) for cloud in clouds] if single else [
+            _thickness(np.concatenate(clouds), _QUERIES)
+        ]  # fmt: skip
+    thick, upright = np.concatenate(result, axis=1)
+    level = thick[upright > _LEVEL]
+    return float(np.median(thick)), float(np.median(level)) if len(level) >= _FEW_LEVEL else np.nan
 
 
-def _thickness(points: np.ndarray, queries: int) -> Float[np.ndarray, " q"]:
-    """Standard deviation of neighbouring points across the plane through them, m."""
+def _thickness(points: np.ndarray, queries: int) -> Float[np.ndarray, "2 q"]:
+    """Standard deviation of neighbouring points across their plane, m, and the upright part of its normal."""
     pick = np.linspace(0, len(points) - 1, queries).astype(np.intp)
     near = points[cKDTree(points).query(points[pick], _NEIGHBOURS)[1]]
     offset = near - near.mean(axis=1, keepdims=True)
-    spread = np.linalg.eigvalsh(np.einsum("qni,qnj->qij", offset, offset) / _NEIGHBOURS)
-    return np.sqrt(np.maximum(spread[:, 0], 0.0))
-
-
-def _find_cause(
-    check: PoseCheck, poses: Trajectory, thickness: Callable[..., tuple[float, float]], orders: bool
-) -> PoseCheck:
-    """Undo likely mistakes one by one, and name the one that makes the walls thin."""
-    given = check.compared[0]
-    which = 0 if given == check.thickness else 1
-    limit = min(_EXPLAINS * given, given - _MIN_GAIN)
-    found = [(np.inf, "", False)]
-    if orders:
-        found.append((thickness(reorder(poses))[which], "the quaternions are in the order w, x, y, z", True))
-    for shift in (sign * size for size in _SHIFTS for sign in (1, -1)):
-        side = "later" if shift > 0 else "earlier"
-        words = f"with the poses {abs(shift):g} s {side} they are thin: two clocks differ"
-        moved = Trajectory(poses.times + shift, poses.positions, poses.rotations, poses.source)
-        found.append((thickness(moved)[which], words, False))
-    for axis, name in enumerate(_AXES):
-        for angle in (sign * size for size in _TURNS for sign in (1, -1)):
-            words = f"with the LiDAR turned by {angle:+g}° in {name} they are thin: the extrinsic is off"
-            turn = Rotation.from_euler("xyz"[axis], angle, degrees=True)
-            found.append((thickness(poses, turn)[which], words, False))
-    best, words, wxyz = min(found, key=lambda row: row[0])
-    return check if best > limit else replace(check, cause=words, wxyz=wxyz)
+    spread, axes = np.linalg.eigh(np.einsum("qni,qnj->qij", offset, offset) / _NEIGHBOURS)
+    return np.stack([np.sqrt(np.maximum(spread[:, 0], 0.0)), np.abs(axes[:, 2, 0])])

@@ -24,6 +24,9 @@ GRAVITY = 9.80665  # m/s²
 # A carried or driven IMU averages one g over a recording. Livox publishes g, the others m/s².
 _IN_G, _IN_SI = (0.7, 1.4), (0.7 * GRAVITY, 1.4 * GRAVITY)
 _MIN_SAMPLES = 50  # of an IMU that is used
+_ABSURD = 1e6  # of any unit
+_FREE = 0.3 * GRAVITY  # m/s²; a median force below it has no gravity in it
+_DEGREES = 2.0  # rad/s; a median rate above it is one in degrees
 
 
 @dataclass(frozen=True)
@@ -40,7 +43,8 @@ class Inertial:
 def imu_topics(recording: Recording) -> list[str]:
     """Return the topics with IMU messages; that of the LiDAR's own housing (`/livox/imu`) comes first."""
     beside = recording.topic.rsplit("/", 1)[0]
-    topics = sorted({c.topic for c in recording.reader.connections if c.msgtype == IMU_TYPE})
+    connections = recording.reader.connections if recording.reader else ()
+    topics = sorted({c.topic for c in connections if c.msgtype == IMU_TYPE})
     return sorted(topics, key=lambda topic: topic.rsplit("/", 1)[0] != beside)
 
 
@@ -65,21 +69,28 @@ def imu_samples(recording: Recording, topic: str) -> Iterator[tuple[float, np.nd
 
 
 def read_inertial(recording: Recording, topic: str) -> Inertial | None:
-    """Reads a whole IMU topic, sorted, without repeated times or values not finite, force in m/s².
+    """Reads a whole IMU topic, sorted, without repeated times or values not finite, in rad/s and m/s².
 
-    `None` where fewer than 50 samples are left. Raises `RecordingError` for damage, or a force neither in g nor in
-    m/s².
+    A force without gravity tells no attitude, and is left out: it is 0 then. `None` where fewer than 50 samples are
+    left. Raises `RecordingError` for damage, or a force neither in g nor in m/s².
     """
     samples = [(time, *turn, *push) for time, turn, push in imu_samples(recording, topic)]
     rows = np.asarray(samples, np.float64).reshape(-1, 7)
-    rows = rows[np.isfinite(rows).all(axis=1)]
+    rows = rows[(np.abs(rows[:, 1:]) < _ABSURD).all(axis=1) & np.isfinite(rows[:, 0])]
     rows = rows[np.unique(rows[:, 0], return_index=True)[1]]
     if len(rows) < _MIN_SAMPLES:
         return None
-    size = float(np.median(np.linalg.norm(rows[:, 4:], axis=1)))
-    for (low, high), unit in ((_IN_G, GRAVITY), (_IN_SI, 1.0)):
-        if low < size < high:
-            return Inertial(rows[:, 0], rows[:, 1:4], rows[:, 4:] * unit, topic)
+    turn, size = (float(np.median(np.linalg.norm(rows[:, part], axis=1))) for part in (slice(1, 4), slice(4, 7)))
+    degrees = np.pi / 180.0 if turn > _DEGREES else 1.0
+    # A force without gravity is small in the mean, too: at rest in g it is 1 along one axis
+    free = float(np.linalg.norm(rows[:, 4:].mean(axis=0))) <= 0.5 * size and size < _FREE
+    for (low, high), unit in (((0.0, _FREE), 0.0),) if free else ((_IN_G, GRAVITY), (_IN_SI, 1.0)):
+        if low <= size < high:
+            odd = ["rates in deg/s"] * (degrees != 1.0) + ["force without gravity, which is left out"] * free
+            if odd:
+                recording.facts["imu_units"] = f"{topic}: {', '.join(odd)}"
+                print(f"IMU {recording.facts['imu_units']}", flush=True)
+            return Inertial(rows[:, 0], rows[:, 1:4] * degrees, rows[:, 4:] * unit, topic)
     raise RecordingError(f"{recording.path}: {topic} has a median force of {size:.3g}, which is neither g nor m/s²")
 
 
@@ -122,27 +133,15 @@ def level_rotation(
     recording: Recording, trajectory: Trajectory, inertial: Inertial | None, mount: Mount | None
 ) -> Rotation:
     """Return the smallest turn that makes gravity vertical, averaged over the recording; none without an IMU."""
-    if inertial is None or mount is None:
-        up = _up_at_start(recording)
+    if inertial is None or mount is None:  # that in the LiDAR's own housing shows at first how it is held
+        beside = recording.topic.rsplit("/", 1)[0]
+        topic = next((topic for topic in imu_topics(recording) if topic.rsplit("/", 1)[0] == beside), None)
+        own = read_inertial(recording, topic) if topic else None
+        up = np.zeros(3) if own is None else own.force[own.times < own.times[0] + _START_TIME].sum(axis=0)
     else:
         inside = (inertial.times >= trajectory.times[0]) & (inertial.times <= trajectory.times[-1])
         _, turns = trajectory.at(inertial.times[inside])
         up = turns.apply(inertial.force[inside] @ mount.rotation).mean(axis=0)
-    if up is None or not np.linalg.norm(up) > 0:
+    if not np.linalg.norm(up) > 0:
         return Rotation.identity()
     return Rotation.align_vectors([[0.0, 0.0, 1.0]], [up / np.linalg.norm(up)])[0]
-
-
-def _up_at_start(recording: Recording) -> Float[np.ndarray, "3"] | None:
-    """Return the force that the IMU in the LiDAR's own housing shows at first, in its axes and unit; `None` without."""
-    beside = recording.topic.rsplit("/", 1)[0]
-    topic = next((topic for topic in imu_topics(recording) if topic.rsplit("/", 1)[0] == beside), None)
-    if topic is None:
-        return None
-    total, start = np.zeros(3), None
-    for time, _, force in imu_samples(recording, topic):
-        start = time if start is None else start
-        if time - start > _START_TIME:
-            break
-        total += force
-    return total if np.isfinite(total).all() else None

@@ -19,7 +19,7 @@ from scene.poses.calibration import Calibration, Mount
 from scene.poses.clocks import settle
 from scene.poses.consistency import check_poses, reorder
 from scene.poses.imu import Inertial, find_inertial, gyro_guide, level_rotation
-from scene.poses.odometry import LIBRARY, Guide, Odometry, estimate_odometry
+from scene.poses.odometry import LIBRARY, Guide, estimate_odometry
 from scene.poses.registration import register_scans
 from scene.poses.smoother import Noise, Problem, imu_steps, inertial_problem, solve_with_heading
 from scene.poses.terms import Chain
@@ -42,23 +42,12 @@ class Located:
     most_uncovered: float = 0.05  # Share of the scans that may lie outside the trajectory's time
 
 
-def run_odometry(recording: Recording, guide: Guide | None, progress: Stages) -> Odometry:
-    """Runs LiDAR odometry as a stage of a build."""
-    return estimate_odometry(recording, guide, progress.start("LiDAR odometry", recording.scan_count))
-
-
-def locate_given(trajectory: Trajectory) -> Located:
-    """Takes given poses; only their maker knows how well they fix the length."""
-    return Located(
-        trajectory,
-        {
-            "poses": "given trajectory",
-            "length_fixed_by": "given trajectory",
-            "length_uncertainty": None,
-            "length_uncertainty_from": "not stated: the trajectory came without one",
-        },
-        estimated=False,
-    )
+_GIVEN = {  # only their maker knows how well they fix the length
+    "poses": "given trajectory",
+    "length_fixed_by": "given trajectory",
+    "length_uncertainty": None,
+    "length_uncertainty_from": "not stated: the trajectory came without one",
+}
 
 
 def _find_timed(
@@ -79,7 +68,8 @@ def locate_by_odometry(recording: Recording, calibration: Calibration, progress:
     """
     inertial, mount, clock = _find_timed(recording, calibration, auto)
     guide = gyro_guide(inertial, mount) if inertial and mount else None
-    trajectory = run_odometry(recording, guide, progress).trajectory
+    stage = progress.start("LiDAR odometry", recording.scan_count)
+    trajectory = estimate_odometry(recording, guide, stage).trajectory
     level = level_rotation(recording, trajectory, inertial, mount)
     poses = Trajectory(trajectory.times, level.apply(trajectory.positions), level * trajectory.rotations, LIBRARY)
     facts = {
@@ -121,6 +111,8 @@ def locate_by_control(
             f"{control.path}: control goes with an IMU whose mount is known, and {recording.path} has none; "
             "--calibration names it, or --trajectory gives whole poses"
         )
+    if not inertial.force.any():
+        raise RecordingError(f"{recording.path}: control needs gravity, and {inertial.topic} is without it")
     problem, chain = _solve(recording, inertial, mount, control, calibration, progress)
     return Located(
         _lidar_poses(chain, mount),
@@ -148,7 +140,8 @@ def _solve(
     lever = mount.rotation @ calibration.prism + mount.shift
     problem, chain = inertial_problem(inertial, control, lever, Noise())
     guess = _smooth(progress, lambda: solve_with_heading(problem, chain))
-    odometry = run_odometry(recording, Guide(_lidar_poses(guess, mount), True, *_BY_CONTROL), progress)
+    stage = progress.start("LiDAR odometry", recording.scan_count)
+    odometry = estimate_odometry(recording, Guide(_lidar_poses(guess, mount), True, *_BY_CONTROL), stage)
     whole = replace(problem, steps=imu_steps(odometry, guess, mount))
     return whole, _smooth(progress, lambda: whole.solve(guess)[0])
 
@@ -241,24 +234,32 @@ def place_recording(
     return Placed(registered.cloud, record, facts, located, registered.low)
 
 
+_FOREIGN = 0.5  # correlation of turns up to which poses that blur the walls are those of another drive
+
+
 def _check_given(recording: Recording, given: Trajectory, reading: ReadingConfig) -> Located:
     """Takes given poses after a look at what they make of some scans: their clock first, then their quaternions.
 
     What blurs the walls for another reason is looked for with the clock set right.
     """
-    told, auto = reading.quaternion, reading.clock == "auto"
+    told, auto = reading.quaternion or given.order, reading.clock == "auto"
     poses = reorder(given) if told == "wxyz" else given
     clock, timed = settle(recording, poses, auto)
     check = check_poses(recording, timed, told is None)
-    order = "xyzw (by default)" if told is None else f"{told} (by flag)"
+    if check is not None and check.blurred and not check.cause and clock.agreement < _FOREIGN:
+        raise RecordingError(
+            f"{given.source}: is of another drive than {recording.path}: its turns are other ones (correlation "
+            f"{clock.agreement:.2f}), and its poses blur walls of {1e3 * check.expected:.0f} mm to "
+            f"{1e3 * check.thickness:.0f} mm"
+        )
+    order = "xyzw (by default)" if told is None else f"{told} (by {'flag' if reading.quaternion else 'header'})"
     if check is not None and check.wxyz:
         poses, order = reorder(given), "wxyz (detected: as xyzw they blur the walls)"
         print(f"quaternions of {given.source}: {order}", flush=True)
         clock, timed = settle(recording, poses, auto)
         check = check_poses(recording, timed, False)
-    located = locate_given(timed if clock.corrected else poses)
-    facts = {**located.facts, "quaternions": order, **clock.facts, **({} if check is None else check.facts)}
-    return replace(located, facts=facts)
+    facts = {**_GIVEN, "quaternions": order, **clock.facts, **({} if check is None else check.facts)}
+    return Located(timed if clock.corrected else poses, facts, estimated=False)
 
 
 def _check(recording: Recording, located: Located) -> Located:

@@ -1,6 +1,6 @@
 """TUM files: poses over time, and positions of a prism without attitude."""
 
-import warnings
+import re
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -10,7 +10,11 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation, Slerp
 
 from scene.errors import RecordingError, require_input
+from scene.reading.source import cause
+from scene.reading.times import seconds_in
 
+_NUMBER = re.compile(r"[-+]?\.?\d[^a-zA-Z]")
+_HEADER = re.compile(r"(?i)\bq_?(?:rs_)?[wx]")
 _QUATERNION_TOLERANCE = 0.01  # by which the length of a quaternion may differ from 1
 
 
@@ -22,6 +26,7 @@ class Trajectory:
     positions: Float[np.ndarray, "n 3"]  # m
     rotations: Rotation  # Sensor to fixed frame, `n` of them
     source: str  # Origin of the poses, for messages
+    order: str | None = None  # Of quaternions, `xyzw` or `wxyz`, where the file's header says so
 
     @property
     def path(self) -> Path:
@@ -49,26 +54,42 @@ def save_tum(trajectory: Trajectory, path: Path) -> None:
     np.savetxt(path, rows, fmt="%.9f")
 
 
-def read_rows(path: Path, kind: str) -> Float[np.ndarray, "n k"]:
-    """Reads rows of numbers of one length, none from an empty file; raises `RecordingError` where it is not `kind`."""
+def read_rows(path: Path, kind: str) -> tuple[Float[np.ndarray, "n k"], list[str]]:
+    """Reads rows of numbers of one length, and the names of their columns where a header has them.
+
+    Columns are apart by white space, commas, semicolons or tabs; decimals may have a comma. The first column is a time,
+    s, or since 1970 in ms, us or ns. No rows from an empty file. Raises `RecordingError` where it is not `kind`.
+    """
     require_input(path)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # an empty file is reported by the caller
-            rows = np.loadtxt(path, dtype=np.float64, ndmin=2)
-    except (ValueError, UnicodeDecodeError, IsADirectoryError) as error:
-        raise RecordingError(f"{path}: not {kind} ({error})") from error
+        lines = [line.strip() for line in path.read_text("utf-8-sig").splitlines() if line.strip()]
+        first = next((k for k, line in enumerate(lines) if _NUMBER.match(line)), 0)
+        header = next((line for line in reversed(lines[:first]) if _HEADER.search(line)), "")
+        body = [line for line in lines[first:] if not line.startswith(("#", "%"))]
+        text = "\n".join(body)
+        if ";" in text or ("." not in text and ", " not in text and "," in text and len(body[0].split()) > 1):
+            body = [line.replace(",", ".") for line in body]
+        rows = np.array([[float(word) for word in re.split(r"[\s,;]+", line.strip(",; \t"))] for line in body])
+    except (ValueError, OSError) as error:
+        raise RecordingError(f"{path}: not {kind} ({cause(error)})") from error
     if not np.isfinite(rows).all():
         raise RecordingError(f"{path}: row {int(np.argmin(np.isfinite(rows).all(axis=1))) + 1} is not finite")
-    return rows
+    if rows.size:
+        rows[:, 0] *= seconds_in(float(np.median(rows[:, 0])))
+    return rows, re.split(r"[\s]*[,;\t][\s]*|\s+(?!\[)", header.lstrip("#% "))
 
 
 def load_tum(path: Path) -> Trajectory:
     """Reads `t x y z qx qy qz qw` rows; rows out of order are sorted, repeated times dropped.
 
-    Raises `RecordingError` for a file that is unreadable, malformed, or has positions without orientation.
+    A header that names more columns, or w first, as EuRoC's, is followed. Raises
+    `RecordingError` for a file that is unreadable, malformed, or has positions without orientation.
     """
-    rows = read_rows(path, "a TUM trajectory")
+    rows, names = read_rows(path, "a TUM trajectory")
+    letters = "".join(name.partition("[")[0].strip()[-1:].lower() for name in names[4:8])
+    order = {"wxyz": "wxyz", "xyzw": "xyzw"}.get(letters)
+    if rows.ndim == 2 and rows.shape[1] > 8 and order is not None:
+        rows = rows[:, :8]
     if rows.shape[1:] != (8,) or len(rows) < 2:
         raise RecordingError(f"{path}: a TUM trajectory has at least 2 rows of 8 numbers, found {rows.shape}")
     norms = np.linalg.norm(rows[:, 4:], axis=1)
@@ -82,7 +103,7 @@ def load_tum(path: Path) -> Trajectory:
     rows = rows[np.unique(rows[:, 0], return_index=True)[1]]
     if len(rows) < 2:
         raise RecordingError(f"{path}: all rows carry the same time")
-    return Trajectory(rows[:, 0], rows[:, 1:4], Rotation.from_quat(rows[:, 4:]), str(path))
+    return Trajectory(rows[:, 0], rows[:, 1:4], Rotation.from_quat(rows[:, 4:]), str(path), order)
 
 
 _MIN_CONTROL_ROWS = 10  # of a control within the recording
@@ -118,7 +139,7 @@ def load_control(path: Path) -> Control:
 
     Raises `RecordingError` for a file that is unreadable or malformed, has too few rows, or all at one place.
     """
-    rows = read_rows(path, "position control in TUM form")
+    rows, _ = read_rows(path, "position control in TUM form")
     if rows.size and rows.shape[1] not in (4, 8):
         raise RecordingError(f"{path}: control has rows of 4 or 8 numbers (t x y z, TUM), found {rows.shape[1]}")
     unique = rows[np.unique(rows[:, 0], return_index=True)[1]] if rows.size else rows

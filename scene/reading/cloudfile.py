@@ -46,11 +46,18 @@ def read_cloud(
         "format_by": detected.by,
         **frame.facts,
     }
-    if source.crs:
-        facts["crs"] = source.crs
+    if crs := source.crs or _crs_beside(path):
+        facts["crs"] = crs
     if source.left_out:
         facts["points_left_out"] = dict(source.left_out)
     return thinned.cloud(), facts | {"points_read": read, "points_dropped": read - thinned.returns}
+
+
+def _crs_beside(path: Path) -> str | None:
+    """Return the text of a `.prj` file of the cloud's name, as geographic programs write it; `None` without one."""
+    beside = next((file for end in (".prj", ".PRJ") if (file := path.with_suffix(end)).is_file()), None)
+    text = beside.read_text("utf-8", "replace") if beside else ""
+    return " ".join(text.split()) or None
 
 
 def _frame_of(path: Path, source: CloudSource, config: ReadingConfig) -> Frame:

@@ -200,4 +200,7 @@ def _detect_in_folder(path: Path, rows: dict[str, Format]) -> Detected | None:
     if surveys:
         names = ", ".join(file.name for file in surveys)
         raise RecordingError(f"{path}: holds {len(surveys)} ring surveys ({names}); name one")
-    return Detected(path, rows["scans"], "content") if scan_files(path) else None
+    if scan_files(path):
+        return Detected(path, rows["scans"], "content")
+    folders = [file for file in files if file.is_dir()]
+    return _detect_in_folder(folders[0], rows) if len(folders) == 1 else None  # as archives unpack

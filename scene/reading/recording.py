@@ -14,7 +14,7 @@ from scene.errors import RecordingError
 from scene.reading.formats import detect
 from scene.reading.scans import ScanSource
 from scene.reading.source import refuse_damage
-from scene.reading.times import MOST_BAD, Convention, RawScan, Scan, Spans, TimeConfig
+from scene.reading.times import MOST_BAD, SHORT, WHOLE, Convention, RawScan, Scan, Spans, TimeConfig, join_scans
 
 _MOST_OUT_OF_ORDER = 0.05  # share of the scans
 _LONGEST_PAUSE = 3600.0  # s; a stamp further from the last one is damage, and would make all later ones look late
@@ -26,7 +26,6 @@ class Recording:
     Attributes:
         path: The recording.
         topic: The LiDAR topic read; the folder's name for a folder of scans.
-        scan_count: Scans in the recording.
         facts: Detected facts, for the manifest; `point_times` and the counts of what is left out follow on reading.
 
     Raises:
@@ -53,7 +52,7 @@ class Recording:
             beside = (tuple(part.path for part in parts),) if parts else ()
             self._source: ScanSource = detected.format.open(detected.path, topic, *beside)
         self._source.facts["format_by"] = detected.by
-        self.topic, self.scan_count, self.facts = self._source.topic, self._source.scan_count, self._source.facts
+        self.topic, self.facts = self._source.topic, self._source.facts
 
     @property
     def reader(self) -> Any:
@@ -80,10 +79,28 @@ class Recording:
             spans.add(raw)
         return spans
 
+    @cached_property
+    def _groups(self) -> list[list[int]]:
+        """Numbers of the messages of each sweep: one, or as many as make a whole one where they are short."""
+        stamps, step = self.stamps, self.convention.step
+        if step >= SHORT or self.convention.kind == "static":
+            return [[number] for number in range(len(stamps))]
+        groups: list[list[int]] = []
+        for number, stamp in enumerate(stamps):
+            if not groups or not -step < stamp - stamps[groups[-1][0]] < WHOLE - 0.5 * step:
+                groups.append([])
+            groups[-1].append(number)
+        return groups
+
+    @property
+    def scan_count(self) -> int:
+        """Number of sweeps."""
+        return len(self._groups)
+
     @property
     def stamps(self) -> Float[np.ndarray, " n"]:
-        """Header of each sweep, s."""
-        return np.array([row[0] for row in self._spans.rows])
+        """Header of each sweep, s; the time of recording where headers say nothing."""
+        return np.array([row[1 if self.convention.by_receipt else 0] for row in self._spans.rows])
 
     @cached_property
     def convention(self) -> Convention:
@@ -112,8 +129,9 @@ class Recording:
         """
         convention, last, late = self.convention, None, 0
         self._points = self._bad = 0
-        for index, raw in enumerate(self._source.scans()):
-            scan = self._timed(convention, raw)
+        messages = self._source.scans()
+        for index, group in enumerate(self._groups):
+            scan = join_scans([self._timed(convention, next(messages)) for _ in group])
             if last is not None and scan.stamp <= last:
                 late += 1
                 self.facts["scans_out_of_order"] = late
@@ -139,8 +157,9 @@ class Recording:
     def pick(self, numbers: Iterable[int]) -> Iterator[tuple[int, Scan]]:
         """Yields some of the scans with their numbers; the others are not decoded."""
         wanted = sorted(set(numbers))
-        for number, raw in zip(wanted, self._source.scans(only=frozenset(wanted)), strict=True):
-            yield number, self.convention.apply(raw)[0]
+        messages = self._source.scans(only=frozenset(one for number in wanted for one in self._groups[number]))
+        for number in wanted:
+            yield number, join_scans([self.convention.apply(next(messages))[0] for _ in self._groups[number]])
 
     def _timed(self, convention: Convention, raw: RawScan) -> Scan:
         """Return a sweep by the convention, and count what has no time in it."""

@@ -13,6 +13,7 @@ from typing import IO, Any
 
 from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag2 import Reader as Reader2
+from rosbags.rosbag2.storage_mcap import McapReader
 from rosbags.typesys import Stores, get_typestore
 
 from scene.errors import RecordingError
@@ -29,19 +30,6 @@ from scene.reading.source import cause, one_line, refuse_damage
 _PROFILE_AT = 17  # byte after magic, opcode and length of the header record; its two strings take 8 bytes or more
 _ROS2_PROFILE = b"\x04\0\0\0ros2"
 _KNOWN_SCHEMAS = ("ros2msg", "ros2idl", "omgidl", "")
-
-
-class _AnyProfile:
-    """A path whose file says that its profile is ROS2."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-
-    def __str__(self) -> str:
-        return str(self._path)
-
-    def open(self, mode: str) -> "_Ros2Header":
-        return _Ros2Header(self._path.open(mode))
 
 
 class _Ros2Header:
@@ -73,6 +61,16 @@ class _Schemas(dict[int, Any]):
         super().__setitem__(
             key, schema._replace(name=name) if known else schema._replace(name=name, encoding="", data="")
         )
+
+
+class _Mcap(McapReader):
+    """The library's reader, for files of any profile."""
+
+    bio: Any
+
+    def _open(self) -> None:
+        self.bio, self.schemas = _Ros2Header(self.bio), _Schemas()
+        super()._open()
 
 
 _BAG_NAMES = {"bag": "ROS1 bag", "rosbag2": "ROS2 bag", "db3": "ROS2 bag", "mcap": "MCAP file"}
@@ -122,7 +120,7 @@ class RosBag(ScanSource):
         return self._store.deserialize_cdr(raw, message_type)
 
     def scans(self, only: frozenset[int] | None = None) -> Iterator[RawScan]:
-        """Yields the scans in the order of the bag; a header without a stamp takes the time of its message.
+        """Yields the scans in the order of the bag.
 
         Of `only` some the others are not parsed. Raises `RecordingError`, which says which
         message is damaged.
@@ -156,7 +154,7 @@ class RosBag(ScanSource):
             except Exception as error:
                 raise ValueError(f"not a whole PointCloud2: {cause(error)}") from error
             stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
-            scan = parse_pointcloud2(message, stamp or received)
+            scan = parse_pointcloud2(message, stamp)
         return replace(scan, received=received)
 
     def _choose(self, topic: str | None) -> tuple[list[Any], list[str]]:
@@ -186,7 +184,8 @@ class _Chain:
     """Bags one after another, in the order of their first messages: a recording that was split."""
 
     def __init__(self, readers: list[Any]) -> None:
-        self._readers = sorted(readers, key=lambda reader: next((row[1] for row in reader.messages()), 0))
+        first = {id(one): next((row[1] for row in one.messages(connections=one.connections)), 0) for one in readers}
+        self._readers = sorted(readers, key=lambda reader: first[id(reader)])
         self._connections = [list(reader.connections) for reader in self._readers]
 
     @property
@@ -218,11 +217,8 @@ def _likelihood(connection: Any) -> tuple[bool, bool, bool, int]:
 
 def _open_reader(path: Path, format: str) -> Any:
     """Opens a folder, or one storage file whatever its name ends in, with the library's reader."""
-    if format == "mcap":
-        reader: Any = Reader2.STORAGE_PLUGINS[".mcap"](_AnyProfile(path))  # type: ignore[arg-type]
-        reader.schemas = _Schemas()
-    elif format == "bag":
-        reader = Reader1(path)
+    if format in ("mcap", "bag"):
+        reader: Any = _Mcap(path) if format == "mcap" else Reader1(path)
     else:
         reader = Reader2(path) if path.is_dir() else Reader2.STORAGE_PLUGINS[f".{format}"](path)
     reader.open()

@@ -20,16 +20,7 @@ from jaxtyping import Shaped
 from scene.errors import RecordingError
 from scene.reading.ply_pcd import read_pcd_records, read_ply_records
 from scene.reading.source import cause, stack_xyz
-from scene.reading.times import TIME_FIELDS, RawScan, make_scan
-
-
-class _NoTopics:
-    """A bag's reader for recordings that hold nothing beside their scans."""
-
-    connections: tuple[Any, ...] = ()
-
-    def messages(self, **_: Any) -> Iterator[Any]:
-        return iter(())
+from scene.reading.times import RawScan, make_scan, seconds_in, time_field
 
 
 class ScanSource:
@@ -40,14 +31,14 @@ class ScanSource:
         topic: The LiDAR topic; the file's or folder's name where there are no topics.
         scan_count: Number of scans.
         facts: Detected facts, for people and the manifest; `kind` is needed.
-        reader: A bag's reader, for the IMU beside the LiDAR: `connections` and `messages(connections=…)`.
+        reader: A bag's reader, for the IMU beside the LiDAR: `connections` and `messages(connections=…)`; else `None`.
     """
 
     path: Path
     topic: str
     scan_count: int
     facts: dict[str, Any]
-    reader: Any = _NoTopics()
+    reader: Any = None
 
     def __init__(
         self,
@@ -87,9 +78,9 @@ def scan_from_records(stamp: float, records: Shaped[np.ndarray, " n"]) -> RawSca
 
     Raises `ValueError` where a coordinate is missing.
     """
-    name = next((name for name in TIME_FIELDS if name in (records.dtype.names or ())), None)
+    name, unit = time_field(records.dtype.names or ())
     points = stack_xyz(records).astype(np.float32)
-    return make_scan(stamp, points, None if name is None else records[name], name or "")
+    return replace(make_scan(stamp, points, None if name is None else records[name], name or ""), unit=unit)
 
 
 LIVOX_TYPES = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
@@ -143,16 +134,10 @@ def parse_pointcloud2(message: Any, stamp: float) -> RawScan:
 
     Raises `ValueError` without coordinates, or for a layout that contradicts itself.
     """
-    points = _cloud_records(message)
-    names = points.dtype.names or ()
-    time = next((name for name in TIME_FIELDS if name in names), None)
-    xyz = np.stack([points["x"], points["y"], points["z"]], axis=1)
-    if xyz.dtype != np.float64:
-        xyz = xyz.astype(np.float32)  # native byte order
-    return make_scan(stamp, xyz, None if time is None else points[time], time or "")
+    return scan_from_records(stamp, cloud_records(message))
 
 
-def _cloud_records(message: Any) -> Shaped[np.ndarray, " n"]:
+def cloud_records(message: Any) -> Shaped[np.ndarray, " n"]:
     """Return the points as records of x, y, z and any time, without padding at the end of rows."""
     width, height, step, row = message.width, message.height, message.point_step, message.row_step
     if not width * height:
@@ -171,14 +156,15 @@ def _cloud_records(message: Any) -> Shaped[np.ndarray, " n"]:
 
 def _record_layout(message: Any, step: int) -> np.dtype:
     order = ">" if message.is_bigendian else "<"
+    names = [field.name for field in message.fields]
+    wanted = {time_field(names)[0], *(name for name in names if name.lower() in ("x", "y", "z"))}
     fields: dict[str, tuple[str, int]] = {}
     for field in message.fields:
-        if field.name in ("x", "y", "z", *TIME_FIELDS) and field.name not in fields:
+        if field.name in wanted and field.name not in fields:
             if field.datatype not in _FIELD_TYPES:
                 raise ValueError(f"a PointCloud2 whose field {field.name} is of unknown type {field.datatype}")
             fields[field.name] = (order + _FIELD_TYPES[field.datatype], field.offset)
-    missing = [name for name in "xyz" if name not in fields]
-    if missing:
+    if missing := [name for name in "xyz" if name not in map(str.lower, fields)]:
         raise ValueError(f"a PointCloud2 without the field {', '.join(missing)}")
     for name, (kind, offset) in fields.items():
         if offset + np.dtype(kind).itemsize > step:
@@ -189,8 +175,7 @@ def _record_layout(message: Any, step: int) -> np.dtype:
 
 _FORMATS = {".pcd": "PCD", ".ply": "PLY", ".bin": "KITTI bin"}
 _LISTS = ("times.txt", "timestamps.txt")
-# Whole numbers as names are times since 1970, in the unit that puts them after 1973; smaller ones only count.
-_NAME_UNITS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (1e8, 1.0))
+_LEAST = 10**8  # s since 1970; smaller numbers in names only count
 _KITTI = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")])
 
 
@@ -245,13 +230,11 @@ def _read_list(path: Path, count: int) -> list[float]:
         raise RecordingError(f"{path}: cannot be read ({cause(error)})") from error
     if len(lines) != count:
         raise RecordingError(f"{path}: holds {len(lines)} times for {count} scans")
-    times = []
-    for index, line in enumerate(lines):
-        time = _time_in_line(line)
-        if time is None:
-            raise RecordingError(f"{path}: line {index + 1} is no time: {line[:40]!r}")
-        times.append(time)
-    return times
+    times = [_time_in_line(line) for line in lines]
+    if None in times:
+        index = times.index(None)
+        raise RecordingError(f"{path}: line {index + 1} is no time: {lines[index][:40]!r}")
+    return [time for time in times if time is not None]
 
 
 def _time_in_name(stem: str) -> float | None:
@@ -261,16 +244,16 @@ def _time_in_name(stem: str) -> float | None:
     if "." in numbers[-1]:
         return float(numbers[-1])
     value = int(numbers[-1])
-    if len(numbers) > 1 and len(numbers[-1]) == 9 and int(numbers[-2]) >= 1e8:
+    if len(numbers) > 1 and len(numbers[-1]) == 9 and int(numbers[-2]) >= _LEAST:
         return int(numbers[-2]) + value * 1e-9  # seconds_nanoseconds
-    return next((value * scale for least, scale in _NAME_UNITS if value >= least), None)
+    return value * seconds_in(value) if value >= _LEAST else None
 
 
 def _time_in_line(line: str) -> float | None:
     """Seconds (KITTI odometry), whole nanoseconds, or a date with a time of day (KITTI raw)."""
     try:
         if re.fullmatch(r"\d{11,}", line):
-            return next(int(line) * scale for least, scale in _NAME_UNITS if int(line) >= least)
+            return int(line) * seconds_in(int(line))
         if re.match(r"\d{4}-\d\d-\d\d[ T]", line):
             whole, _, fraction = line.partition(".")
             return datetime.fromisoformat(whole).replace(tzinfo=UTC).timestamp() + float(f"0.{fraction or 0}")

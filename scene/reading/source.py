@@ -60,16 +60,19 @@ class CloudSource:
     left_out: Counter[str] = field(default_factory=Counter)
 
 
-def _require_xyz(names: Sequence[str]) -> None:
-    if missing := [name for name in "xyz" if name not in names]:
+def find_xyz_names(names: Sequence[str]) -> list[str]:
+    """Return the names of x, y and z, in whatever case; raises `ValueError` where one is missing."""
+    known = {name.lower(): name for name in reversed(names)}
+    if missing := [name for name in "xyz" if name not in known]:
         raise ValueError(f"it has no field {', '.join(missing)}")
+    return [known[name] for name in "xyz"]
 
 
 def stack_xyz(records: np.ndarray) -> Float[np.ndarray, "n 3"]:
     """Return x, y and z of structured records as float64; raises `ValueError` where one is missing."""
-    _require_xyz(records.dtype.names or ())
+    names = find_xyz_names(records.dtype.names or ())
     with np.errstate(invalid="ignore"):  # bit patterns that are no number; they are dropped later
-        return np.stack([records[name] for name in "xyz"], axis=1).astype(np.float64)
+        return np.stack([records[name] for name in names], axis=1).astype(np.float64)
 
 
 def source_from_records(format: str, records: np.ndarray) -> CloudSource:
@@ -96,6 +99,7 @@ class Lines:
     line: int = 1  # Its number, from 1, for messages
     count: int | None = None  # Lines to read; all where `None`
     decimal_comma: bool = False  # True where `1,5` means one and a half
+    counted: bool = False  # True where a line of one number may stand before each part, as in PTS
 
     def rows(self) -> Iterator[Float[np.ndarray, "n k"]]:
         """Yields the columns as numbers, block by block; raises `ValueError`, which names the line at fault."""
@@ -124,6 +128,8 @@ class Lines:
         Raises `ValueError`, which names the line that does not hold them.
         """
         lines = block.decode("utf-8", "replace").splitlines()
+        if self.counted:
+            lines = ["" if len(line.split()) == 1 else line for line in lines]
         if self.decimal_comma:
             lines = [line.replace(",", ".") for line in lines]
         try:
@@ -150,8 +156,7 @@ class Lines:
 
 def source_from_text(format: str, path: Path, names: list[str], start: int, line: int, count: int) -> CloudSource:
     """Return a source over `count` lines with a number for each of `names`, from a byte on; `line` is its number."""
-    _require_xyz(names)
-    text = Lines(path, tuple(names.index(name) for name in "xyz"), start=start, line=line, count=count)
+    text = Lines(path, tuple(names.index(name) for name in find_xyz_names(names)), start=start, line=line, count=count)
     none = np.empty((0, 3))
     return CloudSource(format, text.rows, next(text.rows(), none) if count else none)
 

@@ -98,6 +98,7 @@ def find_xyz(names: Sequence[str], told: dict[str, str] | None = None) -> tuple[
 
 _HEAD_BYTES = 1 << 16  # of a file by which its layout is told
 _PROBES = 16  # places of a file that are looked at
+_DECIMALS = re.compile(r"\s*(?:-?\d+,\d+\s+)+-?\d+(?:,\d+)?\s*")  # numbers apart by blanks, with commas in them
 _DELIMITERS = ((";", "semicolon"), ("\t", "tab"), (",", "comma"))
 
 
@@ -110,13 +111,15 @@ def open_table(path: Path, told: dict[str, str] | None = None) -> CloudSource:
     with path.open("rb") as file:
         head = file.read(_HEAD_BYTES)
     if b"\0" in head:
-        raise ValueError("it is binary, not text")
+        wide = head.startswith((b"\xff\xfe", b"\xfe\xff"))
+        raise ValueError("it is text in UTF-16; save it as UTF-8" if wide else "it is binary, not text")
     lines = head.decode("utf-8-sig", "replace").splitlines()
     delimiter, name = _find_delimiter(lines)
-    comma = delimiter == ";" and any("," in line for line in lines) and not any("." in line for line in lines[1:])
+    comma = delimiter != "," and any("," in line for line in lines) and not any("." in line for line in lines[1:])
     skip, columns, unit = _find_columns(lines, delimiter, comma, told)
     start = sum(len(line) for line in head.splitlines(keepends=True)[:skip])
-    text = Lines(path, tuple(columns), delimiter, start, skip + 1, None, comma)
+    start = start or len(head) - len(head.removeprefix(b"\xef\xbb\xbf"))
+    text = Lines(path, tuple(columns), delimiter, start, skip + 1, None, comma, path.suffix.lower() == ".pts")
     return CloudSource(f"text, {name} between columns", text.rows, _sample_lines(text), unit)
 
 
@@ -124,7 +127,8 @@ def _find_delimiter(lines: list[str]) -> tuple[str | None, str]:
     """Delimiter of most lines; white space where there is no other."""
     body = [line for line in lines[:200] if line.strip()]
     for mark, name in _DELIMITERS:
-        if body and sum(line.count(mark) >= 2 for line in body) > len(body) / 2:
+        apart = [line for line in body if line.count(mark) >= 2 and not (mark == "," and _DECIMALS.fullmatch(line))]
+        if body and len(apart) > len(body) / 2:
             return mark, name
     return None, "white space"
 
@@ -142,6 +146,8 @@ def _find_columns(
             raise ValueError(f"no line of names before line {index + 1} holds the columns {', '.join(told.values())}")
         if _numeric(words[:3], comma) or (columns and _numeric([words[i] for i in columns if i < len(words)], comma)):
             return index, columns or [0, 1, 2], unit
+        if not told and {"lat", "latitude", "lon", "longitude"} & {plain_name(word)[0] for word in words}:
+            raise ValueError("its columns are in degrees; project them to metres")
         named = find_xyz(words, told) if len(words) >= 3 else None
         if named is not None:
             columns, unit = named

@@ -6,6 +6,8 @@ clock or of another one; times that begin anew in each sweep count from the head
 it (Ouster, Livox: its start). The growth, or the span of a sweep against the time between two headers, gives the unit.
 """
 
+import re
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
@@ -13,7 +15,7 @@ import numpy as np
 import tyro
 from jaxtyping import Bool, Float, Int, Shaped
 
-TIME_FIELDS = ("t", "time", "offset_time", "timestamp", "time_stamp", "timestamps", "ts")
+_TIME_NAME = re.compile(r"(?:d?t|ts|.*time.*?|.*stamps?|.*offset(?=_))(?:_(ns|us|ms|s)(?:ecs?)?)?")
 STATIC = "none: every sweep is taken as static"
 _UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _LONGEST_SWEEP = 2.0  # s
@@ -23,13 +25,26 @@ _OVER_PERIOD, _UNSURE = 1.2, 5.0  # times the period: longest sweep; up to which
 _LEAST_SWEEP = 0.005  # of the period: a shorter sweep makes the unit unsure
 _GROWS = 0.5  # of the span of a sweep, by which the times of the next one are later: they are absolute
 _EVEN = 0.02  # s of spread about one offset between two clocks; with more the headers rule
+_LEAP = 1.0  # s by which an offset changes at once where a clock begins anew
+_FEWEST = 4  # sweeps between two such leaps, by the offset that they have in common
 _WIDE = 1.5  # times the reach of a sweep from its middle: further is no time of that sweep
+SHORT, WHOLE = 0.075, 0.1  # s: messages closer than that are parts of a sweep, or quick ones; what they are joined to
 MOST_BAD = 0.05  # share of all points without a time of their sweep
 _SAMPLE = 4000  # points of a sweep by which its span is told
 _MOST, _AROUND = 0.85, 3.0  # share of the points that lie about the median; how much further a time of theirs may lie
 _LONG = 0.95  # quantile of the spans of all sweeps that is the length of one: of some the first or last beams are lost
 _COUNTER = 2.0**32  # values of a counter of 32 bits
+_FARTHEST = 1e7  # m; no sensor sees so far
 _FLAG = tyro.conf.arg(prefix_name=False)
+
+
+# Whole numbers since 1970 are in the unit that puts them after 1973.
+_SINCE_1970 = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
+
+
+def seconds_in(value: float) -> float:
+    """Return the unit of a time, s: 1, or less where the number is too large for seconds since 1970."""
+    return next((scale for least, scale in _SINCE_1970 if value >= least), 1.0)
 
 
 @dataclass(frozen=True)
@@ -39,6 +54,12 @@ class TimeConfig:
     # Unit of the times of points: s, ms, us or ns; none leaves them out, and every sweep is static.
     time_unit: Annotated[Literal["s", "ms", "us", "ns", "none"] | None, _FLAG] = None
     time_stamp: Annotated[Literal["start", "end"] | None, _FLAG] = None  # Part of a sweep that its header is of.
+
+
+def time_field(names: Iterable[str]) -> tuple[str | None, str | None]:
+    """Return which field holds the times of points, the shortest name that says time, and the unit that it ends in."""
+    known = [(name, match[1]) for name in names if (match := _TIME_NAME.fullmatch(name.lower()))]
+    return min(known, key=lambda pair: len(pair[0]), default=(None, None))
 
 
 @dataclass(frozen=True)
@@ -76,7 +97,7 @@ class RawScan:
 def make_scan(
     stamp: float, points: Float[np.ndarray, "n 3"], values: Shaped[np.ndarray, " n"] | None, name: str = ""
 ) -> RawScan:
-    """Return a sweep as a reader has it; points at the origin (nothing came back) and not finite ones are dropped.
+    """Return a sweep as a reader has it, less points at the origin (nothing came back), not finite or absurdly far.
 
     Args:
         stamp: Stamp of the message, s.
@@ -84,7 +105,7 @@ def make_scan(
         values: Point times as stored, in whatever unit; `None` where there are none.
         name: Name of their field.
     """
-    good = np.isfinite(points).all(axis=1) & (points != 0).any(axis=1)
+    good = (np.abs(points) < _FARTHEST).all(axis=1) & (points != 0).any(axis=1)
     return RawScan(stamp, points[good], None if values is None else values[good], name)
 
 
@@ -99,9 +120,11 @@ class Convention:
     reach: float = _LONGEST_SWEEP  # Of a sweep at most, s
     reference: Literal["start", "end"] | None = None  # Part of a sweep that its header is of, where somebody says so
     guessed: bool = False  # True where nothing tells whether a header is of the start or the end of its sweep
-    offset: float | None = None  # Of the headers' clock before the points', s; `None` where each header tells its own
-    round: float = np.inf  # Time after which the points' clock begins anew, s
+    # Of the headers' clock before the points', s: one for each time that the latter began anew; none where each header
+    # tells its own
+    offsets: tuple[float, ...] = ()
     by_receipt: bool = False  # True where the headers say nothing and the time of recording stands for them
+    step: float = np.inf  # Usual time from one message to the next, s
 
     def apply(self, raw: RawScan) -> tuple[Scan, int]:
         """Return the sweep with its returns in the order of time, and the number left out for want of a time."""
@@ -129,11 +152,16 @@ class Convention:
         times = times - low
         if self.kind == "same clock":
             return low, times
-        if self.offset is None:
-            return begin, times
-        start = low + self.offset
-        rounds = np.rint((stamp - start) / self.round) * self.round if np.isfinite(self.round) else 0.0
-        return start + float(rounds), times
+        start = min((low + offset for offset in self.offsets), key=lambda at: abs(at - begin), default=np.inf)
+        return (start if abs(start - begin) < _LEAP else begin), times
+
+
+def join_scans(parts: list[Scan]) -> Scan:
+    """Return one sweep of several messages that follow one another."""
+    if len(parts) == 1:
+        return parts[0]
+    times = np.concatenate([part.times + (part.stamp - parts[0].stamp) for part in parts])
+    return Scan(parts[0].stamp, np.concatenate([part.points for part in parts]), times)
 
 
 def _unwrap(values: Shaped[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
@@ -163,7 +191,7 @@ class Spans:
 
     name: str = ""
     unit: str | None = None
-    wraps: bool = False  # True where the times are a counter of 32 bits
+    counts: bool = False  # True where the times are a counter of 32 bits
     rows: list[tuple[float, float, float, float]] = field(default_factory=list)  # header, receipt, s; first, last value
     timed: list[int] = field(default_factory=list)  # Number of each sweep with times, among all
     points: int = 0  # In all of them
@@ -177,7 +205,7 @@ class Spans:
                 inside = values[good][apart <= _AROUND * np.quantile(apart, _MOST)]
                 low, high = float(inside.min()), float(inside.max())
             self.name, self.unit = self.name or raw.name, self.unit or raw.unit
-            self.wraps = _counts_32(raw.values)
+            self.counts = _counts_32(raw.values)
             self.timed.append(len(self.rows))
         self.rows.append((raw.stamp, raw.received, low, high))
         self.points += len(raw.points)
@@ -207,12 +235,15 @@ class Spans:
         by = f" ({why})" if told.time_unit or told.time_stamp else ""
         length = max(float(np.quantile(spans, _LONG)) * found.scale, 1e-9)
         reach = max(length, float(np.fmin(_usual_step(stamp), _LONGEST_SWEEP)))
-        return replace(found, words=found.words + by + note, by_receipt=by_receipt, length=length, reach=reach)
+        step = _usual_step(stamp)
+        joined = "; they are put together to sweeps of 0.1 s" if step < SHORT else ""
+        words = found.words + by + joined + note
+        return replace(found, words=words, by_receipt=by_receipt, length=length, reach=reach, step=step)
 
     def _decide_relative(self, stamp: np.ndarray, low: np.ndarray, high: np.ndarray, told: TimeConfig) -> Convention:
         span, period = float(np.median(high - low)), _usual_step(stamp)
         unit = told.time_unit or self.unit
-        unit = unit or self._unit_of_span(span, float(np.maximum(high, -low).max()), period)
+        unit = unit or self._unit_of_span(span, float(np.median(np.maximum(high, -low))), period)
         scale = _UNITS[unit]
         side, guessed = "after the stamp (its start)", self.unit is None and told.time_stamp is None
         if float(np.median(-low)) > float(np.median(high)):
@@ -226,27 +257,26 @@ class Spans:
     def _decide_absolute(self, stamp: np.ndarray, low: np.ndarray, high: np.ndarray, told: TimeConfig) -> Convention:
         unit = told.time_unit or self.unit or self._unit_of_growth(stamp, low)
         scale = _UNITS[unit]
-        round = _COUNTER * scale if self.wraps else np.inf
         ahead = stamp - low * scale
-        if self.wraps:
-            ahead -= round * np.rint((ahead - ahead[0]) / round)
         offset = float(np.median(ahead))
-        even = float(np.median(np.abs(ahead - offset))) < _EVEN
         length = f"sweeps of {np.median(high - low) * scale:.3g} s"
         if abs(offset) < _SAME_CLOCK and np.median(low) * scale > _FIRST_EPOCH and told.time_stamp is None:
             words = f"`{self.name}`, absolute, {_shown(unit)}; {length}, {offset:+.3g} s from the headers"
             return Convention("same clock", words, scale)
+        offsets = _steady_offsets(ahead, _COUNTER * scale if self.counts else 0.0)
         reference = told.time_stamp or "start"
-        rule = f"{offset:.9g} s behind the headers" if even else "each header tells when its sweep began"
+        rule = "each header tells when its sweep began"
+        if offsets:
+            rule = f"{offsets[0]:.9g} s behind the headers"
+            rule += f", and otherwise {len(offsets) - 1} times, since it began anew" if len(offsets) > 1 else ""
         words = (
             f"`{self.name}`, absolute by another clock, {_shown(unit)}; {length}, {rule}; a header is taken for the "
             f"{reference} of its sweep"
         )
-        if reference == "end":
-            offset -= float(np.quantile(high - low, _LONG)) * scale
+        late = float(np.quantile(high - low, _LONG)) * scale if reference == "end" else 0.0
         return Convention(
             "other clock", words, scale, reference=reference, guessed=told.time_stamp is None,
-            offset=offset if even else None, round=round,
+            offsets=tuple(one - late for one in offsets),
         )  # fmt: skip
 
     def _unit_of_span(self, span: float, largest: float, period: float) -> str:
@@ -285,6 +315,21 @@ class Spans:
         near = [name for name, scale in _UNITS.items() if abs(first * scale - at) < _SAME_CLOCK]
         since = [name for name, scale in reversed(_UNITS.items()) if first * scale > _FIRST_EPOCH]
         return (near + since + ["s"])[0]
+
+
+def _steady_offsets(ahead: Float[np.ndarray, " n"], turn: float) -> tuple[float, ...]:
+    """Return the offsets that headers have from times, in their order, s; none where they wander or leap too often.
+
+    A counter begins anew after `turn`, s: 0 where times are none. Other clocks do so when they are set, or start again.
+    """
+    turns = np.rint((ahead - ahead[0]) / turn) if turn else np.zeros(len(ahead))
+    ahead = ahead - turn * turns
+    parts = [part for part in np.split(ahead, np.flatnonzero(np.abs(np.diff(ahead)) > _LEAP) + 1)
+             if len(part) >= min(_FEWEST, len(ahead))]  # fmt: skip
+    middles = np.array([np.median(part) for part in parts])
+    if not len(parts) or np.median(np.abs(ahead[:, None] - middles).min(axis=1)) >= _EVEN:
+        return ()
+    return tuple((middles[:, None] + turn * np.unique(turns)).ravel().tolist())
 
 
 def _headers_repeat(table: Float[np.ndarray, "n 4"]) -> bool:

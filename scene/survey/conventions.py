@@ -5,8 +5,9 @@ A survey is written in any of them, so that readers can be tried on all.
 
 import math
 import shutil
+from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Annotated, Any, Literal
@@ -17,16 +18,18 @@ import yaml
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from scene.survey.lidar import Lidar, Sweep
-from scene.survey.messages import CUSTOM_TYPE, STORE, encode_cloud, unix_nanoseconds
+from scene.survey.lidar import BEAMS, Lidar, Sweep
+from scene.survey.messages import CUSTOM_DEFINITION, CUSTOM_TYPE, STORE, encode_cloud, unix_nanoseconds
 from subterra_jax.host.files import replace_file, replace_folder
 
 _FLAG = tyro.conf.arg(prefix_name=False)
 _TICKS = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 _UNDERFLOW = 2**32 - 1_000_000  # what a counter of 32 bits makes of -1 ms in ns
 _ROS2 = get_typestore(Stores.ROS2_HUMBLE)
+_LIVOX = get_types_from_msg(CUSTOM_DEFINITION, CUSTOM_TYPE)
+_ROS2.register({name: kind for name, kind in _LIVOX.items() if name not in _ROS2.types})  # its own header stays
 _PLUGINS = {"mcap": StoragePlugin.MCAP, "db3": StoragePlugin.SQLITE3}
 
 
@@ -44,6 +47,10 @@ class Convention:
     boot: Annotated[float, _FLAG] = 320.0  # Time that the sensor had run at the first sweep, s.
     bad_times: Annotated[float, _FLAG] = 0.0  # Share of the points whose time is that of no sweep.
     by_ring: Annotated[bool, _FLAG] = False  # Points in the order of rings, not of time.
+    # What stands for a beam without return: nothing, a point in the sensor itself, or numbers that are none.
+    empty: Annotated[Literal["left out", "zero", "nan"], _FLAG] = "left out"
+    pieces: Annotated[int, _FLAG] = 1  # Messages that a sweep is published in, one after another.
+    missing: Annotated[float, _FLAG] = 0.0  # Share of the messages that never came.
     big_endian: Annotated[bool, _FLAG] = False  # Numbers of points with their highest byte first.
     imu_late: Annotated[float, _FLAG] = 0.0  # How much later the IMU's clock is than the LiDAR's, s.
     container: Annotated[Literal["bag", "mcap", "db3"], _FLAG] = "bag"  # A bag of ROS 1, or a folder of ROS 2.
@@ -51,10 +58,12 @@ class Convention:
 
     def check(self) -> None:
         """Raises `ValueError` for numbers out of range, and for times that no field of that type can hold."""
-        if not 0.0 <= self.bad_times <= 1.0:
-            raise ValueError(f"bad_times must lie between 0 and 1, got {self.bad_times:g}")
-        if self.bags < 1:
-            raise ValueError(f"bags must be at least 1, got {self.bags}")
+        for name in ("bad_times", "missing"):
+            if not 0.0 <= getattr(self, name) < 1.0:
+                raise ValueError(f"{name} must lie between 0 and 1, got {getattr(self, name):g}")
+        for name in ("bags", "pieces"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
         for name in ("boot", "imu_late"):
             if not math.isfinite(getattr(self, name)):
                 raise ValueError(f"{name} must be finite, got {getattr(self, name):g}")
@@ -65,9 +74,26 @@ class Convention:
             raise ValueError("point_type u4 holds neither fractions nor times before the header")
 
 
+def pieces_of(sweep: Sweep, lidar: Lidar, convention: Convention) -> Iterator[tuple[Sweep, Lidar]]:
+    """Yields the parts of a sweep that are published as messages of their own, less those that never came."""
+    rng = np.random.default_rng([sweep.number, 0x105])
+    for beams in np.array_split(np.arange(len(sweep.offset)), convention.pieces):
+        if rng.random() < convention.missing:
+            continue
+        if convention.pieces == 1:
+            yield sweep, lidar
+            continue
+        parts = {name: getattr(sweep, name)[beams] for name in BEAMS}
+        first = int(parts["offset"][0])
+        parts["offset"] = parts["offset"] - first
+        stamp = min(lidar.stamp, int(parts["offset"][-1]))
+        part = replace(lidar, offset=parts["offset"], line=lidar.line[beams], stamp=stamp)
+        yield replace(sweep, begin=sweep.begin + first, **parts), part
+
+
 def encode(sweep: Sweep, lidar: Lidar, convention: Convention) -> bytes:
-    """Serialises a sweep as a `sensor_msgs/PointCloud2` by a convention; beams without return are left out."""
-    seen = np.flatnonzero(sweep.valid)
+    """Serialises a sweep as a `sensor_msgs/PointCloud2` by a convention."""
+    seen = np.flatnonzero(sweep.valid) if convention.empty == "left out" else np.arange(len(sweep.valid))
     if convention.by_ring:
         seen = seen[np.argsort(lidar.line[seen], kind="stable")]
     last = int(sweep.offset[-1])
@@ -79,11 +105,14 @@ def encode(sweep: Sweep, lidar: Lidar, convention: Convention) -> bytes:
         times = _point_times(sweep, seen, stamp, convention)
     order = ">" if convention.big_endian else "<"
     points = np.zeros(len(seen), [(name, order + kind) for name, kind in kinds.items()])
-    points["x"], points["y"], points["z"] = sweep.points[seen].T
+    none = np.nan if convention.empty == "nan" else 0.0
+    points["x"], points["y"], points["z"] = np.where(sweep.valid[seen, None], sweep.points[seen], none).T
     points["intensity"], points["ring"] = sweep.reflectivity[seen], lidar.line[seen]
     if times is not None:
         points[convention.point_field] = times
-    return encode_cloud(sweep.number, stamp, lidar.name.encode(), 1, points, dense=True)
+    rings = int(lidar.line.max()) + 1
+    rows = rings if convention.by_ring and convention.empty != "left out" and len(seen) % rings == 0 else 1
+    return encode_cloud(sweep.number, stamp, lidar.name.encode(), rows, points, dense=convention.empty == "left out")
 
 
 def _point_times(sweep: Sweep, seen: np.ndarray, stamp: int, convention: Convention) -> np.ndarray:
@@ -177,12 +206,3 @@ def _join_parts(folder: Path, stem: str, count: int) -> None:
         for one, other in zip(whole["topics_with_message_count"], facts["topics_with_message_count"], strict=True):
             one["message_count"] += other["message_count"]
     (folder / "metadata.yaml").write_text(yaml.safe_dump({"rosbag2_bagfile_information": whole}, sort_keys=False))
-
-
-def kind_of(convention: Convention, own: str) -> str:
-    """Return the type of the messages of a LiDAR whose driver publishes `own`; raises `ValueError` for one of ROS 1."""
-    if convention.point_times != "driver":
-        return "sensor_msgs/msg/PointCloud2"
-    if own == CUSTOM_TYPE and convention.container != "bag":
-        raise ValueError(f"the driver's own {own} is a message of ROS 1 here; point_times makes it a PointCloud2")
-    return own

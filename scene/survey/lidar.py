@@ -54,6 +54,9 @@ class Sweep:
     velocity: Float32[np.ndarray, "n"] | None = None  # Speed of each range, m/s, of a LiDAR that measures it
 
 
+BEAMS = ("offset", "valid", "points", "reflectivity", "second", "placed")  # fields of a sweep with an entry a beam
+
+
 AVIA_POINT_RATE = 240_000  # points/s [geode.md]
 AVIA_LINES = 6
 _AVIA_HALF_FOV = np.deg2rad([35.2, 38.6])  # half of 70.4° across by 77.2° upright [geode.md]

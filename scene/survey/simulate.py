@@ -27,7 +27,7 @@ from scene.survey.carrier import (
 )
 from scene.survey.cast import Caster, Face, n_sweeps, sweeps
 from scene.survey.config import LidarName, SurveyConfig
-from scene.survey.conventions import Convention, Recorder, encode, kind_of
+from scene.survey.conventions import Convention, Recorder, encode, pieces_of
 from scene.survey.lidar import SCAN_PERIOD, Lidar, Sweep, avia, os1, vlp16
 from scene.survey.mesh import Mesh
 from scene.survey.write import CloudWriter, describe_truth, write_json, write_mesh, write_tum, write_yaml
@@ -48,12 +48,11 @@ class Device:
 
 
 def make_device(name: LidarName, config: SurveyConfig) -> Device:
-    """Return the device called `name`, with the convention's messages; raises `ValueError` where it has none."""
+    """Return the device called `name`, with the convention's messages."""
     own, convention = _own_device(name, config), config.convention
-    kind = kind_of(convention, own.kind)
     if convention.point_times == "driver":
         return own
-    return replace(own, kind=kind, encode=partial(encode, convention=convention))
+    return replace(own, kind=messages.CLOUD_TYPE, encode=partial(encode, convention=convention))
 
 
 def _own_device(name: LidarName, config: SurveyConfig) -> Device:
@@ -107,7 +106,8 @@ def write_recording(
             while at < end:
                 bag.write(topic, at, raw)
                 at, topic, raw = next(waiting)
-            bag.write(device.topic, end, device.encode(sweep, device.lidar))
+            for piece, lidar in pieces_of(sweep, device.lidar, convention):
+                bag.write(device.topic, end, device.encode(piece, lidar))
             returns += int(sweep.valid.sum())
             if cloud:
                 cloud.add(sweep.placed[sweep.valid], sweep.reflectivity[sweep.valid])

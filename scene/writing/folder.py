@@ -2,8 +2,10 @@
 
 import dataclasses
 import hashlib
+import io
 import json
 import xml.etree.ElementTree as ET
+import zipfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -68,9 +70,9 @@ def write_folder(
     (folder / "build.html").write_text(render_page(name, result.bore, judgement, content), encoding="utf-8")
     write_manifest(folder / "manifest.json", content, config)
     if result.cloud is not None:
-        preview = trimesh.PointCloud(thin_cloud(result.cloud, _PREVIEW_VOXEL)).export(file_type="ply")
-        note = f"\ncomment crs {crs}".encode("ascii", "replace") if crs else b""
-        (folder / "cloud.ply").write_bytes(preview.replace(b" 1.0", b" 1.0" + note, 1))
+        trimesh.PointCloud(thin_cloud(result.cloud, _PREVIEW_VOXEL)).export(folder / "cloud.ply")
+        if crs:
+            _comment(folder / "cloud.ply", f"crs {crs}")
     if result.odometry is not None:
         save_tum(result.odometry, folder / "odometry.tum")
     for scene in SCENES:
@@ -81,11 +83,27 @@ def write_folder(
 
 
 def state_crs(folder: Path, crs: str) -> None:
-    """Writes the coordinate reference system of an input into both scenes, as the MJCF text `crs`."""
+    """Writes the coordinate reference system of an input into every file of a scene that can hold one.
+
+    As the MJCF text `crs` into scenes, as a comment into PLY files, and as the field `crs` into archives of NumPy.
+    """
     text = ET.tostring(ET.Element("text", name="crs", data=crs), encoding="unicode")
     for scene in SCENES:
         content = (folder / scene).read_text()
         (folder / scene).write_text(content.replace("</mujoco>", f"  <custom>{text}</custom>\n</mujoco>"))
+    for file in sorted(folder.rglob("*.ply")):
+        _comment(file, f"crs {crs}")
+    for file in sorted(folder.rglob("*.npz")):
+        field = io.BytesIO()
+        np.save(field, np.array(crs))
+        with zipfile.ZipFile(file, "a") as archive:
+            archive.writestr(zipfile.ZipInfo("crs.npy"), field.getvalue())
+
+
+def _comment(file: Path, text: str) -> None:
+    """Writes a comment into the header of a PLY file."""
+    form, version, rest = file.read_bytes().partition(b" 1.0")
+    file.write_bytes(form + version + b"\ncomment " + text.encode("ascii", "replace") + rest)
 
 
 def write_geometry(

@@ -7,7 +7,16 @@ import numpy as np
 import pytest
 
 from benchmarks import recordings
-from benchmarks.recordings import Case, RecordingsConfig, draw_case, drive_through, read_case, write_case
+from benchmarks.recordings import (
+    Case,
+    RecordingsConfig,
+    build_case,
+    compare,
+    draw_case,
+    drive_through,
+    read_case,
+    write_case,
+)
 from scene.survey.conventions import Convention
 
 
@@ -19,48 +28,68 @@ def test_every_kind_is_drawn_and_the_same_number_draws_the_same():
     for name, odds in recordings._ODDS.items():
         drawn = Counter(getattr(case.convention, name) for case in cases)
         assert set(drawn) == set(odds), name
-    assert {case.beside for case in cases} == {"nothing", "trajectory", "IMU"}
+    assert {(case.sensor, case.beside) for case in cases} == {
+        (sensor, beside) for sensor in ("vlp16", "avia") for beside in ("trajectory", "IMU")
+    }
 
 
 @pytest.fixture(scope="module")
-def drive(tmp_path_factory):
+def drives(tmp_path_factory):
     folder = tmp_path_factory.mktemp("drive")
-    whole = drive_through(RecordingsConfig(), folder)
-    return folder, replace(whole, sweeps=whole.sweeps[90:150])
+    wholes = [drive_through(RecordingsConfig(), folder, sensor) for sensor in ("vlp16", "avia")]
+    return folder, {one.sensor: replace(one, sweeps=one.sweeps[90:150]) for one in wholes}
 
 
 CASES = {
-    "as its driver has it": (Case(Convention(), "nothing", 0.0), "as control"),
+    "as its driver has it": (Case(Convention(), "vlp16", "trajectory", 0.0), "as control"),
     "since boot, headers at the end, a trajectory that is late": (
-        Case(Convention("boot", "ns", header_of="end", bags=2), "trajectory", 0.4), "as control"),
+        Case(Convention("boot", "ns", header_of="end", bags=2), "vlp16", "trajectory", 0.4), "as control"),
     "since boot, 32 bits, an IMU that is early": (
-        Case(Convention("boot", "ns", "u4", imu_late=-0.3, container="mcap"), "IMU", -0.3), "as control"),
-    "constant, beside a trajectory": (Case(Convention("constant"), "trajectory", 0.0), "static, as said"),
-    "too many bad times": (Case(Convention("header", "us", bad_times=0.1), "nothing", 0.0), "refused, true reason"),
+        Case(Convention("boot", "ns", "u4", imu_late=-0.3, container="mcap"), "vlp16", "IMU", -0.3), "as control"),
+    "constant, beside a trajectory": (Case(Convention("constant"), "vlp16", "trajectory", 0.0), "static, as said"),
+    "too many bad times": (
+        Case(Convention("header", "us", bad_times=0.1), "vlp16", "trajectory", 0.0), "refused, true reason"),
+    "Livox' own message in ROS 2": (
+        Case(Convention(container="mcap", bags=2), "avia", "trajectory", 0.3), "as control"),
+    "half sweeps of a Livox, NaN where nothing came back": (
+        Case(Convention("epoch", "ns", empty="nan", pieces=2, missing=0.02), "avia", "trajectory", 0.0), "as control"),
 }  # fmt: skip
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
-def test_a_recording_is_read_as_it_was_written(drive, name):
-    folder, one = drive
+def test_a_recording_is_read_as_it_was_written(drives, name):
+    folder, known = drives
     case, outcome = CASES[name]
+    one = known[case.sensor]
     row = read_case(one, case, write_case(one, case, folder / "a.bag"))
     assert row.outcome == outcome, row.said
 
 
 @pytest.mark.slow
 def test_a_lidar_before_the_mouth_that_meets_little_loses_nothing(tmp_path):
-    whole = drive_through(RecordingsConfig(), tmp_path)
-    one, case = replace(whole, sweeps=whole.sweeps[:60]), Case(Convention(), "nothing", 0.0)
+    whole = drive_through(RecordingsConfig(), tmp_path, "vlp16")
+    one, case = replace(whole, sweeps=whole.sweeps[:60]), Case(Convention(), "vlp16", "trajectory", 0.0)
     row = read_case(one, case, write_case(one, case, tmp_path / "a.bag"))
     assert row.outcome == "as control", row.said
 
 
 @pytest.mark.slow
-def test_a_reader_that_takes_ms_for_s_is_found_out(drive, monkeypatch):
-    folder, one = drive
-    case = Case(Convention("header", "ms"), "nothing", 0.0)
+def test_a_reader_that_takes_ms_for_s_is_found_out(drives, monkeypatch):
+    folder, one = drives[0], drives[1]["vlp16"]
+    case = Case(Convention("header", "ms"), "vlp16", "trajectory", 0.0)
     path = write_case(one, case, folder / "a.bag")
     monkeypatch.setattr("scene.reading.times._UNITS", {"s": 1.0, "ms": 1.1e-3, "us": 1e-6, "ns": 1e-9})
     assert read_case(one, case, path).outcome == "wrong in silence"
+
+
+@pytest.mark.slow
+def test_a_bore_by_late_poses_is_no_other_one_and_a_bent_one_is(drives):
+    folder, known = drives
+    one = known["avia"]
+    right = Case(Convention(), "avia", "trajectory", 0.0)
+    bore, _ = build_case(one, right, write_case(one, right, folder / "c.bag"))
+    late = replace(right, late=0.4, convention=Convention("boot", "us"))
+    again, _ = build_case(one, late, write_case(one, late, folder / "d.bag"))
+    assert compare(bore, again)[0] < 0.005
+    assert compare(bore, replace(bore, radius=1.01 * bore.radius))[0] > 0.02

@@ -92,3 +92,11 @@ def simulated(tmp_path_factory) -> Simulated:
     named = BuildConfig(provenance="simulated")
     found = build(survey / "survey.bag", scene, survey / "groundtruth.tum", named)
     return Simulated(survey, scene, found, json.loads((survey / "truth.json").read_text()))
+
+
+@pytest.fixture
+def silent(recwarn):
+    """No warning of a library reaches the user, whatever the input."""
+    yield
+    seen = [one for one in recwarn if issubclass(one.category, RuntimeWarning | UserWarning)]
+    assert not [one for one in seen if not issubclass(one.category, pytest.PytestWarning)]

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scene.survey.conventions import Convention, Recorder, encode
+from scene.survey.conventions import Convention, Recorder, encode, pieces_of
 from scene.survey.lidar import Lidar, Sweep
 from scene.survey.messages import CLOUD_TYPE, EPOCH
 
@@ -30,5 +30,6 @@ def write_convention(path: Path, count: int = 12, point_times: str = "header", *
                 bag.start_part()
             begin = round((start - EPOCH) * 1e9)
             sweep = Sweep(k, begin, OFFSET, ~zero, points, zero.astype(np.uint8), zero, points)
-            bag.write("/points", begin + 100_000_000, encode(sweep, LIDAR, convention))
+            for piece, lidar in pieces_of(sweep, LIDAR, convention):
+                bag.write("/points", begin + 100_000_000, encode(piece, lidar, convention))
     return bag.path

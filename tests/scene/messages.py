@@ -45,7 +45,7 @@ def pointcloud2(
     stamp: float, fields, step: int, columns: dict, cdr=False, big=False, height=1, row_padding=0, point_count=None
 ) -> bytes:
     """One serialised message with the given layout; bytes between the fields are filled with 0xAB."""
-    count = len(columns["x"])
+    count = len(next(iter(columns.values())))
     layout = np.dtype(
         {
             "names": [f[0] for f in fields],

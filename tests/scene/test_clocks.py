@@ -41,18 +41,18 @@ def lidar() -> LidarTurns:
 @pytest.mark.parametrize("late", [0.0, 0.02, 0.1, -0.1, 0.7, -1.2])
 def test_a_lag_is_found_whatever_the_mount(lidar, late):
     mount = Rotation.from_euler("zyx", [130.0, -20.0, 70.0], degrees=True)
-    assert find_lag(lidar, turns_of_gyro(gyro(late, mount))) == pytest.approx(late, abs=0.6 * NOTICED)
+    assert find_lag(lidar, turns_of_gyro(gyro(late, mount)))[0] == pytest.approx(late, abs=0.6 * NOTICED)
     poses = Trajectory(AT + late, np.zeros((len(AT), 3)), attitude(AT) * mount, "poses")
-    assert find_lag(lidar, turns_of_poses(poses)) == pytest.approx(late, abs=0.6 * NOTICED)
+    assert find_lag(lidar, turns_of_poses(poses))[0] == pytest.approx(late, abs=0.6 * NOTICED)
 
 
 def test_turns_of_another_drive_and_none_at_all_tell_nothing(lidar):
     other = Trajectory(AT, np.zeros((len(AT), 3)), attitude(0.61 * AT + 500.0), "poses")
-    assert find_lag(lidar, turns_of_poses(other)) is None
+    assert find_lag(lidar, turns_of_poses(other))[0] is None
     even = LidarTurns(lidar.start, lidar.end, np.full_like(lidar.rate, 0.2))
-    assert find_lag(even, turns_of_gyro(gyro(0.1, Rotation.identity()))) is None
+    assert find_lag(even, turns_of_gyro(gyro(0.1, Rotation.identity())))[0] is None
     calm = LidarTurns(lidar.start, lidar.end, 0.05 * lidar.rate)  # agrees, but any noise would as well
-    assert find_lag(calm, turns_of_gyro(gyro(0.1, Rotation.identity()))) is None
+    assert find_lag(calm, turns_of_gyro(gyro(0.1, Rotation.identity())))[0] is None
 
 
 class Beside:
@@ -117,3 +117,12 @@ def test_headers_at_the_end_of_their_sweeps_are_told_by_the_turns_where_nothing_
     assert (recording.late == 0.0) == ended
     assert clock.offset == pytest.approx(0.0 if ended else -0.1, abs=0.006)
     assert (clock.words is None) == ended
+
+
+@pytest.mark.parametrize("late", [0.3, -0.3])
+def test_a_clock_that_is_off_is_set_right_and_not_doubled(lidar, monkeypatch, late):
+    monkeypatch.setattr(clocks, "lidar_turns", lambda recording: lidar)
+    poses = Trajectory(AT + late, np.zeros((len(AT), 3)), attitude(AT), "poses")
+    clock, moved = settle(Beside(), poses, True)
+    assert clock.offset == pytest.approx(late, abs=0.006)
+    np.testing.assert_allclose(moved.times, AT, atol=0.006)

@@ -25,6 +25,7 @@ from tests.scene.bags import write_bag, write_imu_bag
 from tests.scene.files import CLOUDS, RING_HEADER, ring_rows, write_las, write_xlsx
 from tests.scene.messages import LIVOX2, OUSTER, POINTCLOUD2, livox_cdr, pointcloud2, write_bag1, write_bag2, write_mcap
 
+pytestmark = pytest.mark.usefixtures("silent")
 CASES = 60
 POINTS = np.random.default_rng(0).uniform(-3, 3, (200, 3)).astype(np.float32) * [10, 1, 1]
 

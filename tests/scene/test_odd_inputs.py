@@ -6,6 +6,7 @@ import xml.etree.ElementTree as ET
 import laspy
 import numpy as np
 import pytest
+import trimesh
 from laspy.vlrs.known import WktCoordinateSystemVlr
 from mujoco import MjModel
 
@@ -179,13 +180,20 @@ def test_two_lidars_in_one_bag_are_asked_for(tmp_path):
         assert recording.topic == "/lidar_rear/points"
 
 
-def test_both_scenes_hold_the_crs_of_their_input(tmp_path):
+def test_every_file_that_can_hold_one_has_the_crs_of_the_input(tmp_path):
     for scene in SCENES:
         (tmp_path / scene).write_text("<mujoco>\n  <worldbody />\n</mujoco>\n")
+    np.savez(tmp_path / "tunnel.npz", station=XYZ)
+    trimesh.PointCloud(XYZ).export(tmp_path / "lining.ply")
     state_crs(tmp_path, WKT)
     for scene in SCENES:
         MjModel.from_xml_path(str(tmp_path / scene))
         assert ET.parse(tmp_path / scene).find("custom/text[@name='crs']").get("data") == WKT
+    with np.load(tmp_path / "tunnel.npz") as data:
+        assert str(data["crs"]) == WKT
+        np.testing.assert_array_equal(data["station"], XYZ)
+    assert f"comment crs {WKT}".encode() in (tmp_path / "lining.ply").read_bytes()
+    np.testing.assert_allclose(trimesh.load(tmp_path / "lining.ply").vertices, XYZ)
 
 
 def test_nothing_in_the_bore_is_named_where_the_poses_scatter_the_returns():

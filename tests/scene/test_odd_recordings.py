@@ -13,6 +13,7 @@ from tests.scene.bags import custom_msg, write_bag, write_imu_bag, write_tum
 from tests.scene.files import CLOUDS
 from tests.scene.messages import CODES, PLAIN, VELODYNE, pointcloud2, write_bag1
 
+pytestmark = pytest.mark.usefixtures("silent")
 XYZ = np.random.default_rng(0).uniform(-9, 9, (300, 3)).astype(np.float32)
 
 

@@ -6,10 +6,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from scene.errors import RecordingError
 from scene.judging.sanity import doubt_bore
 from scene.poses import consistency
+from scene.poses.calibration import UNCALIBRATED
 from scene.poses.consistency import check_poses, reorder
-from scene.poses.trajectory import Trajectory
+from scene.poses.place import place_recording
+from scene.poses.trajectory import Trajectory, save_tum
+from scene.progress import Stages
+from scene.reading.formats import ReadingConfig
 from scene.reading.recording import Recording
 from tests.scene.bags import write_bag
 
@@ -84,7 +89,7 @@ def test_a_pitched_mount_is_named_though_a_flat_fan_sees_little_but_upright_wall
         assert check_poses(flat, trajectory()).words is None
         wrong = trajectory(turn=(0.0, 3.0, 0.0))
         assert "-3° in pitch they are thin: the extrinsic is off" in check_poses(flat, wrong).words
-        monkeypatch.setattr(consistency, "_WORSE", np.inf)
+        monkeypatch.setattr(consistency, "_TILTED", 0.0)
         assert check_poses(flat, wrong).words is None, "the median would do"
 
 
@@ -101,3 +106,12 @@ def test_quaternions_in_the_other_order_are_found(recording):
 
 def test_poses_of_another_time_tell_nothing(recording):
     assert check_poses(recording, trajectory(late=1000.0)) is None
+
+
+def test_a_trajectory_of_another_drive_is_refused_in_one_sentence(recording, tmp_path):
+    time = np.arange(-20, RATE * 12 * 2) / (2 * RATE)
+    position, attitude = pose(0.61 * time + 40.0)
+    save_tum(Trajectory(100.0 + time, position, attitude, ""), tmp_path / "other.tum")
+    given = (tmp_path / "other.tum", None, UNCALIBRATED, 0.1, ReadingConfig())
+    with Stages() as stages, pytest.raises(RecordingError, match=r"other\.tum: is of another drive than .*walk\.bag"):
+        place_recording(recording.path, *given, stages)

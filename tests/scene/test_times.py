@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
+from benchmarks.rewrite import RewriteConfig, rewrite
 from scene.errors import RecordingError
 from scene.reading.recording import Recording
 from scene.reading.times import Scan, TimeConfig
+from scene.survey.conventions import Convention
 from tests.scene.conventions import sweeps, write_convention
 from tests.scene.messages import pointcloud2, write_bag1
 
@@ -135,3 +137,10 @@ def test_times_that_grow_by_no_unit_are_refused(tmp_path):
     ]
     with pytest.raises(RecordingError, match=r"grow by 300 in a second of the headers: by no unit"):
         read(write_bag1(tmp_path / "a.bag", {"/points": raw}))
+
+
+@pytest.mark.parametrize("how", [{"point_times": "epoch", "point_unit": "ns"}, {"container": "mcap", "pieces": 2}])
+def test_a_recording_is_written_anew_as_another_driver_has_it(tmp_path, how):
+    whole = write_convention(tmp_path / "a.bag", point_times="boot", boot=320.0)
+    convention = Convention(**{"point_times": "header", **how})
+    agree(read(rewrite(RewriteConfig(whole, tmp_path / "b.bag", convention=convention)))[0])

@@ -24,6 +24,12 @@ def test_rows_out_of_order_are_sorted(tmp_path):
     np.testing.assert_array_equal(trajectory.positions[:, 0], [1, 2])
 
 
+@pytest.mark.parametrize(("start", "end", "there"), [(1, 2, 1), (1.2, 1.5, 1), (0.9, 1.5, 0), (1.5, 2.1, 0), (0, 3, 0)])
+def test_a_time_is_covered_where_both_its_ends_are(tmp_path, start, end, there):
+    rows = "1 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n"
+    assert load_tum(write(tmp_path / "t.tum", rows)).covers(start, end) == bool(there)
+
+
 def test_a_pose_between_two_rows_is_half_way(tmp_path):
     turned = Rotation.from_euler("z", 90, degrees=True).as_quat()
     rows = "0 0 0 0 0 0 0 1\n1 4 0 0 " + " ".join(map(str, turned)) + "\n"

@@ -7,6 +7,9 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 import subterra_jax as st
+from benchmarks.rewrite import RewriteConfig, rewrite
+from scene.reading.recording import Recording
+from scene.survey.conventions import Convention
 from subterra_jax.recorder import RecorderConfig, record
 from subterra_jax.recorder.messages import POINT
 
@@ -40,6 +43,19 @@ def test_its_points_lie_on_the_wall_by_the_true_pose(config):
     off = [depth(shell, points, config, lift) for lift in (0.0, 0.5)]
     assert np.median(np.abs(off[0])) < 0.06
     assert np.median(np.abs(off[1])) > 0.1, "half a metre goes unnoticed"
+
+
+def test_its_sweeps_are_written_anew_in_the_convention_of_another_driver(config, tmp_path):
+    convention = Convention(point_times="epoch", point_unit="us", header_of="end", bags=2)
+    path = rewrite(RewriteConfig(config.recording_folder, tmp_path / "a.bag", convention=convention))
+    scans = []
+    for one in (config.recording_folder, path):
+        with Recording(one) as recording:
+            scans.append(list(recording.scans()))
+    assert len(scans[0]) == 3
+    for before, after in zip(*scans, strict=True):
+        assert after.stamp == pytest.approx(before.stamp, abs=1e-5)
+        np.testing.assert_array_equal(after.points, before.points)
 
 
 def depth(shell, points, config, lift):
