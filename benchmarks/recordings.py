@@ -38,7 +38,7 @@ from scene.survey.carrier import IMUS, LIDARS, Carried, calibration, draw_walk, 
 from scene.survey.cast import Caster, sweeps
 from scene.survey.config import SensorErrors, SurveyConfig
 from scene.survey.conventions import Convention
-from scene.survey.lidar import BEAMS, SCAN_PERIOD, VLP16_RINGS, Lidar, Sweep, avia, vlp16
+from scene.survey.lidar import SCAN_PERIOD, VLP16_RINGS, Lidar, Sweep, avia, vlp16
 from scene.survey.messages import EPOCH
 from scene.survey.simulate import TRUTH_RATE, draw_imu_messages, make_device, write_recording
 from scene.survey.write import write_tum
@@ -144,7 +144,7 @@ def drive_through(config: RecordingsConfig, folder: Path, sensor: Sensor) -> Dri
     seen = list(sweeps(np.random.default_rng(of_lidar), lidar, carried, caster, SensorErrors(), 1))
     if sensor == "vlp16":
         kept = np.flatnonzero(np.arange(len(lidar.offset)) // VLP16_RINGS % _EVERY == 0)
-        seen = [replace(sweep, **{name: getattr(sweep, name)[kept] for name in BEAMS}) for sweep in seen]
+        seen = [sweep.pick(kept) for sweep in seen]
         lidar = replace(lidar, offset=lidar.offset[kept], line=lidar.line[kept])
     time = np.arange(round(walk.duration * TRUTH_RATE) + 1) / TRUTH_RATE
     poses = carried.poses(time)

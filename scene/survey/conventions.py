@@ -20,7 +20,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from scene.survey.lidar import BEAMS, Lidar, Sweep
+from scene.survey.lidar import Lidar, Sweep
 from scene.survey.messages import CUSTOM_DEFINITION, CUSTOM_TYPE, STORE, encode_cloud, unix_nanoseconds
 from subterra_jax.host.files import replace_file, replace_folder
 
@@ -83,12 +83,10 @@ def pieces_of(sweep: Sweep, lidar: Lidar, convention: Convention) -> Iterator[tu
         if convention.pieces == 1:
             yield sweep, lidar
             continue
-        parts = {name: getattr(sweep, name)[beams] for name in BEAMS}
-        first = int(parts["offset"][0])
-        parts["offset"] = parts["offset"] - first
-        stamp = min(lidar.stamp, int(parts["offset"][-1]))
-        part = replace(lidar, offset=parts["offset"], line=lidar.line[beams], stamp=stamp)
-        yield replace(sweep, begin=sweep.begin + first, **parts), part
+        part = sweep.pick(beams)
+        first, offset = int(part.offset[0]), part.offset - part.offset[0]
+        model = replace(lidar, offset=offset, line=lidar.line[beams], stamp=min(lidar.stamp, int(offset[-1])))
+        yield replace(part, begin=sweep.begin + first, offset=offset), model
 
 
 def encode(sweep: Sweep, lidar: Lidar, convention: Convention) -> bytes:

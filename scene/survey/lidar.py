@@ -14,7 +14,7 @@ taken as evenly spaced and as starting at the axis.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
@@ -53,8 +53,11 @@ class Sweep:
     placed: Float[np.ndarray, "n 3"]  # Points in the survey frame by the true poses, m; meaningless where not `valid`
     velocity: Float32[np.ndarray, "n"] | None = None  # Speed of each range, m/s, of a LiDAR that measures it
 
-
-BEAMS = ("offset", "valid", "points", "reflectivity", "second", "placed")  # fields of a sweep with an entry a beam
+    def pick(self, beams: Int[np.ndarray, "k"]) -> "Sweep":
+        """Return a part of it; its begin stays."""
+        names = ("offset", "valid", "points", "reflectivity", "second", "placed", "velocity")
+        known = {name: values for name in names if (values := getattr(self, name)) is not None}
+        return replace(self, **{name: values[beams] for name, values in known.items()})
 
 
 AVIA_POINT_RATE = 240_000  # points/s [geode.md]
