@@ -67,7 +67,6 @@ class TrainConfig:
     epochs: int = 4  # passes over the data of one iteration
     minibatches: int = 4  # minibatches per pass; each holds whole unrolls of `n_envs / minibatches` environments
     hidden: tuple[int, ...] = (64, 64)  # widths of the hidden layers, of policy and value alike
-    half: bool = False  # compute in bfloat16; weights stay float32
     standing: float = 0.5  # share of the largest speed by which the range of actions goes below 0, where a robot stands
     # standard deviation of the untrained policy before the tanh, in units of half the action range
     init_std: float = 0.5

@@ -61,7 +61,6 @@ def make_layout(env: Any, params: Any, config: TrainConfig, given: Given | None 
         way_at=WAY_AT if asks else None,
         init_std=config.init_std,
         init_turn=config.init_turn,
-        half=config.half,
     )
     low, high = (tuple(float(bound) for bound in side[:n_action]) for side in (bounds.low, bounds.high))
     return Layout(kept, shape, low, high, config.standing)

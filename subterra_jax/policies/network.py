@@ -32,7 +32,6 @@ class Shape:
     # place in the inputs of the way to go over `inputs.FAR`, which the auxiliary head corrects; None has no such head
     way_at: int | None = None
     init_std: float = 0.5  # standard deviation of the untrained policy before the tanh
-    half: bool = False  # compute in bfloat16; weights and outputs stay float32
     n_seen: int = 0  # Inputs that the actor sees; the critic sees all. 0 is all.
     init_turn: float | None = None  # the same for its second number, the yaw rate; None is `init_std`
 
@@ -59,11 +58,10 @@ class Cell(nn.Module):
     """Gated recurrent unit whose inputs are projected for all steps at once. Source: Cho et al. 2014."""
 
     width: int  # numbers that it keeps
-    dtype: Any  # type that it computes with
 
     def setup(self) -> None:
-        self.of_input = nn.Dense(3 * self.width, dtype=self.dtype)
-        self.of_memory = nn.Dense(3 * self.width, use_bias=False, dtype=self.dtype)
+        self.of_input = nn.Dense(3 * self.width)
+        self.of_memory = nn.Dense(3 * self.width, use_bias=False)
 
     def __call__(self, x: Float[Array, "*batch n"], memory: Float[Array, "*batch cell"]) -> Float[Array, "*batch cell"]:
         return self._turn(self.of_input(x), memory)
@@ -73,12 +71,12 @@ class Cell(nn.Module):
     ) -> Float[Array, "time env cell"]:
         """Returns the memory after every step; it begins anew where `first`."""
         projected = self.of_input(x)
-        kernel = self.of_memory.variables["params"]["kernel"].astype(self.dtype)
+        kernel = self.of_memory.variables["params"]["kernel"]
 
         def step(memory: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:
             of_input, begins = now
             memory = jnp.where(begins[:, None], 0.0, memory)
-            after = _gates(of_input, memory.astype(self.dtype) @ kernel, memory)
+            after = _gates(of_input, memory @ kernel, memory)
             return after, after
 
         return jax.lax.scan(step, memory, (projected, first), unroll=4)[1]
@@ -88,8 +86,8 @@ class Cell(nn.Module):
 
 
 def _gates(of_input: Array, of_memory: Array, memory: Array) -> Array:
-    reset_x, keep_x, new_x = jnp.split(of_input.astype(jnp.float32), 3, axis=-1)
-    reset_h, keep_h, new_h = jnp.split(of_memory.astype(jnp.float32), 3, axis=-1)
+    reset_x, keep_x, new_x = jnp.split(of_input, 3, axis=-1)
+    reset_h, keep_h, new_h = jnp.split(of_memory, 3, axis=-1)
     keep = jax.nn.sigmoid(keep_x + keep_h + 1.0)
     return keep * memory + (1.0 - keep) * jnp.tanh(new_x + jax.nn.sigmoid(reset_x + reset_h) * new_h)
 
@@ -99,15 +97,14 @@ class Perceptron(nn.Module):
 
     widths: tuple[int, ...]  # widths of all layers, the output last
     scale: float  # scale of the untrained output layer
-    dtype: Any  # type that it computes with
 
     @nn.compact
     def __call__(self, x: Float[Array, "*batch n"]) -> Float[Array, "*batch out"]:
         for i, width in enumerate(self.widths[:-1]):
             kernel = nn.initializers.orthogonal(math.sqrt(2.0))
-            x = nn.swish(nn.Dense(width, kernel_init=kernel, dtype=self.dtype, name=f"hidden_{i}")(x))
+            x = nn.swish(nn.Dense(width, kernel_init=kernel, name=f"hidden_{i}")(x))
         last = nn.initializers.orthogonal(self.scale)
-        return nn.Dense(self.widths[-1], kernel_init=last, dtype=self.dtype, name="out")(x).astype(jnp.float32)
+        return nn.Dense(self.widths[-1], kernel_init=last, name="out")(x)
 
 
 class Network(nn.Module):
@@ -117,14 +114,13 @@ class Network(nn.Module):
 
     def setup(self) -> None:
         shape = self.shape
-        dtype = jnp.bfloat16 if shape.half else jnp.float32
-        self.actor = Perceptron((*shape.hidden, shape.n_action), 0.01, dtype)
-        self.critic = Perceptron((*shape.hidden, 1), 1.0, dtype)
+        self.actor = Perceptron((*shape.hidden, shape.n_action), 0.01)
+        self.critic = Perceptron((*shape.hidden, 1), 1.0)
         self.log_std = self.param("log_std", lambda key: jnp.asarray(np.log(shape.spread), jnp.float32))
         if shape.cell:
-            self.cell = Cell(shape.cell, dtype)
+            self.cell = Cell(shape.cell)
         if shape.way_at is not None:
-            self.head = Perceptron((shape.hidden[-1], 2), 0.1, dtype)
+            self.head = Perceptron((shape.hidden[-1], 2), 0.1)
 
     def __call__(self, x: Float[Array, "*batch n"], memory: Any) -> tuple[Outputs, Any]:
         """Returns the answers to one step, and the memory after it.
@@ -181,7 +177,7 @@ def act(actor: Weights, x: Float[Array, "*batch n"]) -> Float[Array, "*batch act
     """
     hidden = [actor[f"hidden_{i}"]["bias"].shape[0] for i in range(len(actor) - 1)]
     widths = (*hidden, actor["out"]["bias"].shape[0])
-    return Perceptron(widths, 1.0, jnp.float32).apply({"params": actor}, x)  # type: ignore[return-value]
+    return Perceptron(widths, 1.0).apply({"params": actor}, x)  # type: ignore[return-value]
 
 
 def to_action(
