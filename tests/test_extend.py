@@ -17,7 +17,7 @@ from subterra_jax.evaluation import evaluate, listed_episodes
 from subterra_jax.host import task_ids
 from subterra_jax.host.loading import load_file
 from subterra_jax.parts import Part
-from subterra_jax.rules import Rule, Start, StopAt, Traverse, Verdict
+from subterra_jax.rules import Start, StopAt, Traverse
 from tests.train.conftest import SMALL, call
 
 pytestmark = pytest.mark.door
@@ -92,14 +92,6 @@ def test_its_params_are_randomised_like_those_of_the_package(desk):
     obs, _ = st.AutoReset(env, params_axes=axes).reset(jax.random.key(1), mixed, 8)
     assert obs.shape == (8, 19)
     assert float(mixed.parts["gyro"].sigma.min()) >= 0.1
-
-
-def test_gymnasium_makes_tasks_with_a_sensor_from_outside(desk):
-    gymnasium = pytest.importorskip("gymnasium")
-    gyro = load_file(desk / "gyro.py")
-    env = gymnasium.make("subterra_jax:Subterra/TraverseShort-v1", parts=(gyro.Gyro(),))
-    assert set(env.observation_space.spaces) == {"ranges", "odometry", "yaw_rate"}
-    assert env.reset(seed=0)[0]["yaw_rate"].shape == (1,)
 
 
 def test_a_task_from_outside_is_evaluated_on_listed_episodes(desk):
@@ -235,13 +227,6 @@ def test_parts_that_do_not_go_together_are_refused_in_one_sentence(rule, parts, 
 def test_a_registration_that_cannot_be_is_refused(id, rule, message):
     with pytest.raises(ValueError, match=message):
         st.register(id, rule, horizon=10)
-
-
-def test_a_rule_without_a_verdict_cannot_be_made():
-    assert issubclass(Traverse, Rule)
-    assert Verdict(jnp.array(True), jnp.array(True), {}).own == ()
-    with pytest.raises(TypeError, match="judge"):
-        type("Half", (Rule,), {})()
 
 
 def test_spaces_have_samples_and_know_what_they_contain():

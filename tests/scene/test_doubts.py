@@ -48,10 +48,6 @@ def climbing(grade: float) -> Bore:
     )  # fmt: skip
 
 
-def test_a_common_tunnel_raises_no_doubt(bore):
-    assert codes(bore) == {}
-
-
 @pytest.mark.parametrize(
     ("by", "said"),
     [(1 / 0.3048, r"--unit ft makes it 5\.6 m by 6 m"), (100, r"--unit cm makes .* REFUSES"),

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from scene.bore import POCKET, Bore
+from scene.bore import Bore
 from scene.fitting import evidence, pockets
 from scene.fitting.evidence import Holes, odds_by_place, pocket_over_wall
 from scene.fitting.section import Sections
@@ -127,10 +127,3 @@ def test_holes_are_what_most_others_at_their_place_in_the_ring_are() -> None:
     assert odds[42] == pytest.approx(0.0, abs=1e-9)  # alone
     assert 1.0 < odds[43] < 3.0
     np.testing.assert_array_equal(np.sign(odds[:40]), np.sign(ratio[:40]))
-
-
-def test_of_two_that_overlap_the_likelier_pocket_stays_whatever_its_contrast() -> None:
-    two = np.zeros(2, POCKET)
-    two["station"], two["angle"], two["length"], two["width"] = (5.0, 5.12), 0.3, 0.2, 0.18
-    two["confidence"] = 1.0, 0.5
-    np.testing.assert_array_equal(pockets._drop_overlaps(two, np.array([2.0, 9.0]), RADIUS), [False, True])

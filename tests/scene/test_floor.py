@@ -126,15 +126,6 @@ def test_a_round_invert_is_no_floor():
     assert not fit_sections(cloud, straight(cloud, tube.middle)).flat_floor
 
 
-def test_an_even_run_leaves_out_what_stands_on_the_floor_and_takes_the_lower_of_two():
-    floor_and_top = [[-3.0, -2.8]] * 10
-    assert [which for _, which in floor._even_run(floor_and_top)] == [0] * 10
-    hidden = [[-3.0]] * 10 + [[-2.3]] * 10 + [[-3.0]] * 10
-    assert [k for k, _ in floor._even_run(hidden)] == [*range(10), *range(20, 30)]
-    assert [k for k, _ in floor._even_run([[], [-3.0], [], [-3.01]])] == [1, 3]
-    assert floor._even_run([[], []]) == []
-
-
 @pytest.mark.parametrize(("plateau", "lower"), [(0.0, False), (0.02, False), (0.22, True)])
 def test_a_lower_floor_is_one_that_lies_well_below_the_first(plateau, lower):
     rng = np.random.default_rng(2)

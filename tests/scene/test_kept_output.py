@@ -10,15 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from scene.inputs import library_versions
 from subterra_jax.host.errors import OutputError
 from subterra_jax.host.files import replace_folder
 
 ROOT = Path(__file__).parents[2]
-
-
-def test_libraries_that_are_not_installed_have_no_version():
-    assert list(library_versions(("numpy", "no-such-library"))) == ["numpy"]
 
 
 def test_a_folder_is_replaced_and_a_half_done_replacement_is_put_right(tmp_path):

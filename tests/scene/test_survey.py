@@ -69,15 +69,6 @@ def cast(folder: Path) -> Cast:
     return load_cast(folder / "truth.ply")
 
 
-def test_the_same_seed_gives_the_same_bytes(folder: Path, tmp_path: Path) -> None:
-    again = make(tmp_path / "again", "--cloud")
-    names = sorted(p.name for p in folder.iterdir())
-    assert names == sorted(p.name for p in again.iterdir())
-    written = {"calibration.yaml", "cloud.ply", "groundtruth.tum", "prism.tum", "survey.bag"}
-    assert set(names) == written | {"truth.json", "truth.ply"}
-    assert all((folder / n).read_bytes() == (again / n).read_bytes() for n in names)
-
-
 def test_the_bag_has_the_topics_types_and_rates_of_geode(bag: Bag) -> None:
     kinds = {topic: (c.msgtype, c.digest, c.msgcount) for topic, c in bag.connections.items()}
     scans = len(bag.lidar)

@@ -88,16 +88,6 @@ def test_wanted_scans_do_not_depend_on_the_unwanted_ones(plan: st.TunnelPlan) ->
     np.testing.assert_array_equal(some[50], everything[50])
 
 
-def test_a_kernel_lowers_for_a_gpu_where_there_is_none(plan: st.TunnelPlan, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    rows = jnp.zeros((64, 2)), jnp.zeros(64), jnp.zeros(64, jnp.int32), jnp.ones(64, bool)
-
-    def scan(tunnel, *rows):
-        return gpu.scan(tunnel, *rows, jnp.float32(30.0), lidar.bearings(16))
-
-    assert "triton" in for_nvidia(scan, Tunnel.from_plan(plan).walls, *rows)
-
-
 def test_a_tunnel_whose_walls_were_replaced_is_cast_by_xla(
     plan: st.TunnelPlan, monkeypatch: pytest.MonkeyPatch
 ) -> None:

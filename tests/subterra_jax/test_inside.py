@@ -24,13 +24,6 @@ def begin(id, n=N, **overrides):
     return env, params, states(params)
 
 
-def test_no_mouth_comes_into_sight_within_the_travel_of_a_relocalisation():
-    _, params, state = begin("Subterra/Relocalise-v1")
-    margin = SEES + float(params.goal.travel_max)
-    assert float(state.station.min()) > margin
-    assert float(state.station.max()) < float(params.tunnel.length) - margin
-
-
 def test_a_hidden_start_is_off_by_three_metres_and_a_known_one_by_nothing():
     _, _, known = begin("Subterra/StopAt-v1")
     _, _, hidden = begin("Subterra/StopAt-v1", hidden_start=True)

@@ -71,13 +71,6 @@ def random_directions(rng: np.random.Generator, *shape: int) -> np.ndarray:
     return way / np.linalg.norm(way, axis=-1, keepdims=True)
 
 
-def test_a_level_scan_on_the_axis_of_a_tube_gives_the_radius_over_the_sine(reliefs):
-    ranges = cast(reliefs["tube"], [30.0, 0.0, 0.0], beams.planar(N_BEAMS)[None])[0]
-    sine = np.abs(np.sin(2 * np.pi * np.arange(N_BEAMS) / N_BEAMS))
-    expected = np.minimum(RADIUS / np.maximum(sine, 1e-9), 30.0)
-    np.testing.assert_allclose(ranges, expected, atol=2e-4)
-
-
 def test_a_tilted_sensor_off_the_axis_meets_the_tube_where_the_quadratic_says(reliefs):
     rng = np.random.default_rng(1)
     angle = np.deg2rad(rng.uniform(-20, 20, 2))
@@ -143,16 +136,6 @@ def test_a_rough_bend_with_recesses_agrees_with_brute_force_over_every_triangle(
     assert np.median(error) < 1e-5
     assert error.max() < 1e-3
     assert (ranges > 15.0).sum() > 20
-
-
-def test_a_batch_gives_what_one_scan_after_another_gives(reliefs):
-    rng = np.random.default_rng(3)
-    origin = np.column_stack([rng.uniform(5, 55, 4), rng.uniform(-1, 1, (4, 2))]).astype(np.float32)
-    way = random_directions(rng, 4, N_BEAMS)
-    batch = cast(reliefs["things"], origin, way)
-    one = jax.jit(lidar3d.cast)
-    alone = [one(reliefs["things"], o, d, o[0], jnp.float32(30.0)) for o, d in zip(origin, way, strict=True)]
-    np.testing.assert_allclose(batch, np.stack(alone), rtol=0.0, atol=2e-6)
 
 
 def test_reliefs_of_the_same_sizes_share_one_program(reliefs):
@@ -299,19 +282,3 @@ def test_an_image_of_beams_has_the_ranges_and_derivatives_of_its_beams(reliefs):
     slopes = [jax.jacfwd(ranges)(place, pattern).reshape(64, 3) for pattern in (beam, beam.reshape(4, 16, 3))]
     assert np.abs(slopes[0]).max() > 0.5
     np.testing.assert_allclose(*slopes, atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("pattern", "sentence"),
-    [
-        (np.zeros((0, 3), np.float32), "needs one or more beams"),
-        (np.float32([[1, 0, 0], [np.nan, 0, 0]]), "beam 1 of the pattern is no number"),
-        (np.float32([[1, 0, 0], [0, 2, 0]]), "beam 1 of the pattern is no unit vector"),
-        (np.float32([[[1, 0, 0], [0, 2, 0]]]), "beam 1 of the pattern is no unit vector"),
-        (np.ones((1, 1, 1, 3), np.float32), "needs one or more beams"),
-    ],
-)
-def test_a_pattern_that_is_none_is_refused(reliefs, pattern, sentence):
-    place = jnp.array([30.0, 0.0, 0.0])
-    with pytest.raises(ValueError, match=sentence):
-        lidar3d.scan(reliefs["tube"], place, jnp.array([1.0, 0.0, 0.0, 0.0]), place[0], jnp.asarray(pattern), 30.0)

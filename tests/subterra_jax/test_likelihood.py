@@ -56,14 +56,6 @@ def crossing(plan, wall, station: float, side: float) -> float:
     return min(o for o in found if 0.0 < o < 6.0)
 
 
-def test_the_map_of_a_straight_tunnel_is_its_half_width_and_has_no_bend(plan_of):
-    straight = plan_of(tunnels.tunnel_arrays(tunnels.straight(40.0), half_width=3.0))
-    walls = wall_map(st.Tunnel.from_plan(straight, "smooth"))
-    np.testing.assert_allclose(walls.wall, 3.0, atol=1e-3)
-    np.testing.assert_allclose(walls.spread, 0.0, atol=1e-6)
-    np.testing.assert_allclose(walls.bend, 0.0, atol=1e-5)
-
-
 def test_the_map_of_a_bend_knows_its_curvature(plan_of):
     bend = plan_of(tunnels.tunnel_arrays(tunnels.arc(60.0, 150.0), half_width=3.0))
     walls = wall_map(st.Tunnel.from_plan(bend, "smooth"))

@@ -140,25 +140,6 @@ def test_the_compiled_step_calls_the_kernels(plan):
 
 
 @pytest.mark.slow
-def test_code_kept_by_one_process_serves_another_and_no_other_version(tmp_path):
-    program = (
-        "import jax, subterra_jax as st; env, params = st.make('Subterra/TraverseShort-v1'); b = st.AutoReset(env);"
-        "obs, _ = jax.jit(b.reset, static_argnums=2)(jax.random.key(0), params, 64); print(float(obs.sum()))"
-    )
-    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), "JAX_PLATFORMS": "cpu"}
-    told = []
-    for _ in range(2):
-        done = subprocess.run(
-            [sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True
-        )
-        told.append(done.stdout)
-    assert told[0] == told[1]
-    versions = list((tmp_path / "subterra" / "native").iterdir())
-    assert len(versions) == 1
-    assert list(versions[0].rglob("*.nbc"))
-
-
-@pytest.mark.slow
 def test_kernels_that_two_processes_compiled_run_in_a_third(tmp_path):
     scan = """
 import jax

@@ -32,15 +32,6 @@ def tunnel():
     return Tunnel.from_plan(st.load_tunnel("subterra-351"), "pockets")
 
 
-@pytest.mark.parametrize(
-    ("turn", "bearing", "expected"),
-    [(0.0, 0.0, 4.5), (np.pi / 4, 0.0, 5.0 - np.sqrt(0.5)), (0.0, np.pi, np.inf), (0.3, np.pi / 2, np.inf)],
-)
-def test_a_beam_meets_a_box_where_geometry_says(turn, bearing, expected):
-    direction = jnp.array([[np.cos(bearing), np.sin(bearing)]], jnp.float32)
-    assert float(distance_along(square(turn=turn), jnp.zeros(2), direction)[0]) == pytest.approx(expected, abs=1e-5)
-
-
 def test_a_beam_from_inside_a_box_meets_it_at_once():
     assert float(distance_along(square(0.1), jnp.zeros(2), jnp.array([[1.0, 0.0]]))[0]) == 0.0
 

@@ -70,11 +70,6 @@ def test_a_tunnel_that_is_not_there_is_refused_in_one_sentence(name, said):
     assert "\n" not in str(error.value)
 
 
-def test_a_kind_says_what_it_has_where_pockets_are_asked_of_sprayed_concrete():
-    with pytest.raises(st.TunnelError, match="'open:sprayed:val:2' has no lining 'pockets'; it has built, bare"):
-        st.make("Subterra/StopAt-v1", tunnel="open:sprayed:val:2", lining="pockets")
-
-
 def test_a_task_longer_than_its_tunnel_is_refused_with_both_lengths():
     short = plan(name_of("cast"), solid=False, length=40.0)
     with pytest.raises(ValueError, match=r"needs a tunnel of 140 m, this one has 40\.0 m"):

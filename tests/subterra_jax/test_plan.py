@@ -60,22 +60,11 @@ def test_a_broken_field_is_named_together_with_its_file(tmp_path, arrays, field,
         st.load_tunnel(path)
 
 
-def test_a_tunnel_file_of_another_version_says_so(tmp_path, arrays):
-    path = tunnels.write_tunnel(tmp_path / "newer.npz", arrays | {"schema": "subterra.tunnel/99"})
-    with pytest.raises(st.TunnelError, match=r"newer\.npz: written by a newer Subterra"):
-        st.load_tunnel(path)
-
-
 def test_a_file_that_is_no_archive_or_not_there_is_named(tmp_path):
     (tmp_path / "text.npz").write_text("not an archive")
     for name in ("text.npz", "absent.npz"):
         with pytest.raises(st.TunnelError, match=name):
             st.load_tunnel(tmp_path / name)
-
-
-def test_an_unknown_lining_is_refused_with_the_ones_there_are(plan_of, arrays):
-    with pytest.raises(st.TunnelError, match="smooth, pockets"):
-        plan_of(arrays).lining("velvet")
 
 
 @pytest.mark.parametrize("lining", ["smooth", "pockets"])

@@ -85,12 +85,6 @@ def test_the_control_tunnel_has_one_curvature_one_width_and_no_landmark():
     np.testing.assert_allclose(seen, np.broadcast_to(seen.mean(axis=0), seen.shape), atol=0.02)
 
 
-def test_the_control_tunnel_takes_its_only_lining_by_default_and_refuses_others():
-    assert resolve("control", None, None, 30.0).count == 1
-    with pytest.raises(st.TunnelError, match="'control' has no lining 'pockets'; it has smooth"):
-        resolve("control", "pockets", None, 30.0)
-
-
 def test_a_range_of_names_and_a_list_of_them_are_one_stack_cut_to_the_piece_of_a_task():
     ranged = resolve("open:val:2-4", "smooth", (0.0, 60.0), 30.0)
     listed = resolve([f"open:val:{i}" for i in (2, 3, 4)], "smooth", (0.0, 60.0), 30.0)

@@ -140,23 +140,6 @@ def test_a_checkpoint_stays_whole_while_it_is_written_again(whole, tmp_path):
     assert digest(run) != newest.facts["digest"]
 
 
-def test_a_folder_that_is_removed_is_never_found_by_half(tmp_path, monkeypatch):
-    place = tmp_path / "checkpoint" / "00000007"
-    (place / "arrays").mkdir(parents=True)
-
-    class KilledError(Exception):
-        """In place of a kill while the content is being deleted."""
-
-    def kill(path, ignore_errors=False):
-        if path.exists():
-            raise KilledError
-
-    monkeypatch.setattr(checkpoint.shutil, "rmtree", kill)
-    with pytest.raises(KilledError):
-        checkpoint.remove_folder(place)
-    assert checkpoint.iterations(tmp_path) == []
-
-
 @pytest.mark.parametrize(
     ("kept", "done", "at"),
     [
