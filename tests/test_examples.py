@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from tests.train import corridor
+from tests.subterra_jax.tunnels import write_corridor
 
 pytestmark = pytest.mark.door
 
@@ -21,7 +21,7 @@ TRAINERS = (*NEEDS, "purejaxrl_like")
 @pytest.fixture(scope="module")
 def options(tmp_path_factory):
     """Episodes of two seconds in a corridor, so that a score takes no time."""
-    path = corridor.write(tmp_path_factory.mktemp("tunnel") / "corridor.npz", length=20.0, half_width=2.0)
+    path = write_corridor(tmp_path_factory.mktemp("tunnel") / "corridor.npz", length=20.0)
     return {"tunnel": str(path), "horizon": 20}
 
 

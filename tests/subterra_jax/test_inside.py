@@ -10,7 +10,6 @@ from subterra_jax.baselines.agent import observed
 from subterra_jax.rules import Choice
 
 N = 2000
-SEES = 30.0  # m, reach of the LiDAR
 
 
 def begin(id, n=N, **overrides):

@@ -111,6 +111,7 @@ def tunnel_arrays(
     seed: int = 0,
     name: str = "procedural",
     transition: float = 4.0,
+    pockets: bool = True,
 ) -> dict[str, Any]:
     """The arrays of a `tunnel.npz`.
 
@@ -124,6 +125,7 @@ def tunnel_arrays(
         seed: Seed of the roughness.
         name: Name in the file.
         transition: Length over which the curvature changes from piece to piece, m.
+        pockets: Whether the lining "pockets" has any.
 
     Returns:
         Field name to array.
@@ -148,7 +150,9 @@ def tunnel_arrays(
         offset = np.full(len(wall_station), half_width)
         if roughness > 0.0:
             offset = offset + _roughness(rng, wall_station, roughness, correlation)
-        pocket_station, pocket_offset = _with_pockets(wall_station, offset, plan.length)
+        pocket_station, pocket_offset = wall_station, offset
+        if pockets:
+            pocket_station, pocket_offset = _with_pockets(wall_station, offset, plan.length)
         for lining, s, d in (("smooth", wall_station, offset), ("pockets", pocket_station, pocket_offset)):
             arrays[f"{side}_{lining}"] = plan.point(s, sign * d)
             arrays[f"{side}_station_{lining}"] = s
@@ -162,6 +166,13 @@ def write_tunnel(path: str | Path, arrays: dict[str, Any]) -> Path:
     path = Path(path)
     np.savez_compressed(path, **arrays)
     return path
+
+
+def write_corridor(path: str | Path, length: float) -> Path:
+    """Write a straight tunnel 4 m wide whose walls are plain in either lining, and return its path."""
+    return write_tunnel(
+        path, tunnel_arrays(straight(length), half_width=2.0, wall_step=0.5, centre_step=0.5, pockets=False)
+    )
 
 
 def provisional() -> dict[str, Any]:

@@ -9,7 +9,7 @@ from filelock import FileLock
 from jaxtyping import install_import_hook
 
 from tests.subterra_jax import checking
-from tests.train import corridor
+from tests.subterra_jax.tunnels import write_corridor
 
 # Shapes in annotations are checked at run time, so that they cannot go stale. Not those of pytrees: jax also rebuilds
 # them around NumPy arrays, shapes and booleans.
@@ -36,7 +36,7 @@ def call(main, *arguments: str) -> int:
 @pytest.fixture(scope="session")
 def tunnel(tmp_path_factory) -> Path:
     """A straight tunnel of 20 m."""
-    return corridor.write(tmp_path_factory.mktemp("tunnel") / "corridor.npz", length=20.0, half_width=2.0)
+    return write_corridor(tmp_path_factory.mktemp("tunnel") / "corridor.npz", length=20.0)
 
 
 @pytest.fixture(scope="session")

@@ -9,7 +9,7 @@ import pytest
 
 import subterra_jax as st
 from subterra_jax.rules import GoalParams, Traverse
-from tests.train import corridor
+from tests.subterra_jax.tunnels import write_corridor
 from train.config import TrainConfig
 from train.driver import Driver, Policy
 from train.evaluate import evaluate
@@ -27,7 +27,7 @@ TINY = TrainConfig(steps=2048, n_envs=16, unroll=16, minibatches=2, hidden=(8,))
 @pytest.fixture(scope="module")
 def world(tmp_path_factory):
     """Goals 4 to 12 m away in a corridor; a metre off is still there, and fifteen seconds are enough."""
-    plan = corridor.write(tmp_path_factory.mktemp("tunnel") / "corridor.npz", length=40.0, half_width=2.0)
+    plan = write_corridor(tmp_path_factory.mktemp("tunnel") / "corridor.npz", length=40.0)
     goal = GoalParams(low=4.0, high=12.0, margin=6.0, tolerance=1.0)
     env, params = st.make(TASK, tunnel=str(plan), goal=goal, horizon=150)
     return World(TASK, env, params, {})

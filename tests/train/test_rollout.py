@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from tests.train import corridor
+from tests.subterra_jax.tunnels import write_corridor
 from train.config import TrainConfig
 from train.driver import Driver, Policy, Seen
 from train.learner import Learner
@@ -99,7 +99,7 @@ def test_the_value_target_of_a_truncated_step_goes_on_with_its_final_observation
 
 def test_a_robot_is_told_the_length_of_its_own_tunnel_of_a_stack(tmp_path):
     lengths = np.array([20.0, 30.0])
-    plans = [corridor.write(tmp_path / f"{length}.npz", length=length, half_width=2.0) for length in lengths]
+    plans = [write_corridor(tmp_path / f"{length}.npz", length=length) for length in lengths]
     env, params = st.make("Subterra/Traverse-v1", tunnel=plans, horizon=HORIZON)
     driver = Driver(env, make_layout(env, params, CONFIG))
     policy = Policy(driver.init(jax.random.PRNGKey(0)))
