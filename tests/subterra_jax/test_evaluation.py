@@ -13,7 +13,7 @@ from flax import struct
 
 import subterra_jax as st
 from subterra_jax import episode
-from subterra_jax.baselines.agent import Agent, observed, shown
+from subterra_jax.baselines.agent import Agent
 from subterra_jax.baselines.registry import AgentError, make_agent, register
 from subterra_jax.evaluation import Records, evaluate, listed_episodes
 from subterra_jax.evaluation import episodes as lists
@@ -86,12 +86,6 @@ class Dawdler(Agent):
         return jnp.stack([speed, yaw_rate, known["station"] + 1.0, jnp.zeros(()), jnp.ones(())]), memory + 1.0
 
 
-def test_an_agent_that_declares_no_input_gets_none():
-    silent = type("Silent", (Agent,), {})()
-    assert (silent.uses_lidar, silent.uses_map, silent.privileged) == (False, False, False)
-    assert (Dawdler().uses_lidar, Dawdler().privileged, Dawdler().name) == (False, True, "dawdler")
-
-
 def test_an_episode_depends_on_its_seed_and_its_tunnel_and_not_on_the_others_driven_with_it(plan_of):
     plans = [plan_of(tunnels.tunnel_arrays(pieces)) for pieces in (tunnels.straight(70.0), tunnels.arc(80.0, 60.0))]
     stacked = st.stack([st.Tunnel.from_plan(plan, "pockets") for plan in plans])
@@ -127,19 +121,6 @@ def test_coverage_ends_at_nine_tenths_as_published_and_progress_goes_on_to_the_m
     # It says that it is a metre further than at the start of each period, and moves 0.2 m in one.
     np.testing.assert_allclose(through.axial_rms, 0.8, atol=0.02)
     np.testing.assert_allclose(through.spl, 54.0 / through.travelled, rtol=1e-4)
-
-
-def test_who_says_what_he_does_not_use_does_not_get_it():
-    env, params = st.make("Subterra/Return-v1", tunnel="subterra-351")
-    flat = jnp.arange(22.0)
-    assert np.isnan(observed(env, params, flat, sees=False).flat[:16]).all()
-    seen = observed(env, params, flat)
-    named = (seen.distance, seen.heading, seen.goal, seen.ring_pitch, seen.flag, seen.start)
-    assert named == (16.0, 17.0, 18.0, 19.0, 20.0, 21.0)
-    hidden = shown(params, sees_map=False).tunnel
-    assert np.isnan(hidden.grid).all()
-    assert np.isnan(hidden.wall).all()
-    assert hidden.length == params.tunnel.length
 
 
 def test_a_name_is_registered_once():

@@ -18,13 +18,6 @@ def arrays():
     return {**made, "ring_pitch": np.array(1.5)}
 
 
-def test_the_packaged_tunnel_has_its_length_and_linings():
-    plan = st.load_tunnel()
-    assert plan.length == pytest.approx(351.0, abs=1.0)
-    assert {"smooth", "pockets"} <= set(plan.linings)
-    assert plan.provenance in ("measured", "simulated")
-
-
 @pytest.mark.parametrize(
     ("field", "spoil"),
     [

@@ -136,16 +136,3 @@ def test_what_a_wider_gauge_costs_does_not_depend_on_where_the_cells_lie(gauge, 
     assert np.ptp(shared) < 0.0125  # a centimetre at four edges
     assert np.max(apart) < 0.011
     assert 0.98 < np.mean(shared) < 1.0
-
-
-def test_trips_are_tried_in_each_of_ten_lattices():
-    assert measure("nav_feasible_agree", judged()).n == 10_000
-
-
-def test_the_lattices_of_a_ground_are_its_columns():
-    ground = judged_ground(judged())
-    lattices = ground.lattices()
-    assert len(lattices) == 10
-    for lattice in lattices:
-        assert lattice.spacing == pytest.approx(lattice.cell) == pytest.approx(0.10)
-    assert sorted(np.concatenate([lattice.left for lattice in lattices])) == pytest.approx(list(ground.left))
