@@ -1,3 +1,5 @@
+"""Pages of the benchmarks stand alone."""
+
 import re
 
 import matplotlib.pyplot as plt

@@ -1,3 +1,5 @@
+"""A bore against the truth of its survey."""
+
 import json
 
 import numpy as np

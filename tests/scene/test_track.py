@@ -1,3 +1,5 @@
+"""Tracks that are laid in a bore: sleepers, gauge, bed, pads, clearance to the walls."""
+
 from dataclasses import replace
 from xml.etree import ElementTree as ET
 

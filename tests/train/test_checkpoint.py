@@ -1,3 +1,5 @@
+"""Checkpoints of the trainer: kept, damaged, changed, resumed from."""
+
 import dataclasses
 import shutil
 

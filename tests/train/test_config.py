@@ -1,3 +1,5 @@
+"""Settings of the trainer: refusals, presets, steps and the order of sums on a GPU."""
+
 import dataclasses
 
 import jax

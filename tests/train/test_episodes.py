@@ -1,3 +1,5 @@
+"""Finished episodes of a run: their order, the window of a hundred, the policy that is kept."""
+
 import json
 
 import jax.numpy as jnp

@@ -1,3 +1,5 @@
+"""Evaluation of policies: scores that geometry tells, the command, ablations."""
+
 import dataclasses
 import json
 

@@ -1,3 +1,5 @@
+"""The log of a run: its files, TensorBoard, the figure of its curves and the table of its seeds."""
+
 import csv
 import json
 import sys

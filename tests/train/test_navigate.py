@@ -1,3 +1,5 @@
+"""The command `python -m train`: its run folder, refusals to overwrite, Ctrl-C, curves."""
+
 import json
 import os
 import signal

@@ -1,3 +1,5 @@
+"""PPO learns to drive through a corridor, stops in time and resumes bit for bit."""
+
 import json
 
 import numpy as np

@@ -1,3 +1,5 @@
+"""An unroll of the trainer: answers, truncated episodes, rewards and what robots are told."""
+
 import jax
 import numpy as np
 import pytest

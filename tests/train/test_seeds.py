@@ -1,3 +1,5 @@
+"""Several seeds trained at once: each as it is alone, resumed together, summed up."""
+
 import dataclasses
 import json
 

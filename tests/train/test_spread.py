@@ -1,3 +1,5 @@
+"""Training spread over devices and processes comes to what one device does."""
+
 import os
 import subprocess
 import sys

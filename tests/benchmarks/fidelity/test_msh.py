@@ -1,3 +1,5 @@
+"""MSH: soundness of the meshes."""
+
 from functools import cache
 
 import numpy as np

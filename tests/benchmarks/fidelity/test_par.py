@@ -1,3 +1,5 @@
+"""PAR: the scene in MJX and the environment on its plan."""
+
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +15,6 @@ from tests.benchmarks.fidelity.judged import measure
 from tests.benchmarks.fidelity.tube import Tube, hold
 
 SHORT = Tube(length=9.0, track=False, variation=0.0)
-DEVICE = ("mjx_put_model", "mjx_contact_parity", "mjx_traj_divergence")
 
 
 @pytest.fixture(scope="module")

@@ -1,3 +1,5 @@
+"""SCN: the scene in MuJoCo."""
+
 from dataclasses import replace
 
 import pytest

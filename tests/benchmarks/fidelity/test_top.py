@@ -1,3 +1,5 @@
+"""TOP: topology of the surface and of the free space."""
+
 from dataclasses import replace
 from functools import cache, partial
 

@@ -1,3 +1,5 @@
+"""TRI: shape, normals and roughness of the triangles."""
+
 from functools import cache
 
 import numpy as np

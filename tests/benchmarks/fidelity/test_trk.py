@@ -1,3 +1,5 @@
+"""TRK: sleepers, rails, pads and fasteners."""
+
 from dataclasses import replace
 from functools import cache, partial
 
