@@ -50,16 +50,6 @@ def test_every_point_of_every_triangle_lies_in_a_cell_that_lists_a_triangle_thro
     assert seen.all()
 
 
-def test_no_triangle_reaches_into_the_empty_prism_and_it_is_nearly_as_wide_as_the_bore(sorted_bend):
-    found, corner = sorted_bend
-    for k, (centre, turn) in enumerate(zip(found.blocks.centre, found.blocks.turn, strict=True)):
-        local = (corner - centre) @ turn.T
-        near = np.abs(local[..., 0]).max(axis=1) < 4.0
-        out = np.einsum("tki,fi->tkf", local[near][..., 1:], cells.FACES).min(axis=1) > found.prism[k]
-        assert out.any(axis=1).all()
-    assert found.prism.min() > 1.75
-
-
 def test_boxes_are_told_from_other_triangles():
     box = surface.Triangles(surface.BOX_CORNERS * [0.2, 0.3, 0.4] + [1.0, 2.0, 3.0], surface.BOX_FACES)
     leaning = surface.Triangles(box.vertices + 0.5 * box.vertices[:, [1, 2, 0]], surface.BOX_FACES)
