@@ -10,10 +10,8 @@ import warnings
 
 import pytest
 import tyro
-from gymnasium.envs import registration
 
 import subterra_jax as st
-from subterra_jax.host import task_ids
 from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
 from subterra_jax.host.errors import OutputError, SubterraError
 from subterra_jax.host.files import replace_file
@@ -195,8 +193,3 @@ def test_every_public_name_of_the_package_is_found_listed_and_no_module():
 def test_what_the_package_offers_can_be_pickled():
     for value in (st.LogUniform(1.0, 2.0), st.AutoReset, st.make, st.SubterraError):
         assert pickle.loads(pickle.dumps(value)) == value
-
-
-def test_gymnasium_knows_every_planar_task():
-    assert set(task_ids.PLANAR) == set(st.TASKS)
-    assert set(st.list_tasks()) <= set(registration.registry)
