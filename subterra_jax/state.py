@@ -138,6 +138,7 @@ class _ParamsOfParts(_Named):
     goal: _Entry[Any] = _Entry()
     told: _Entry[Any] = _Entry()
     goal_coverage: _Entry[Float[Array, ""]] = _Entry()
+    track: _Entry[Any] = _Entry()  # the ground of robots by physics: `physics.ground`
     walk: _Entry[Any] = _Entry()  # the walking robot, its gait, and the surface that it sees: `b2.mission`
     policy: _Entry[Any] = _Entry()
     relief: _Entry[Any] = _Entry()

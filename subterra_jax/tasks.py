@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import importlib.util
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -37,6 +38,8 @@ SLIPPING: tuple[Part, ...] = (*PLAIN, Slip())
 PAPER_TUNNEL = "subterra-351"
 N_TUNNELS = 12  # of the open world where none is named: every kind of every split is as often in them as any other
 _QUICKLY_MADE = ("masonry",)  # kinds taken for a LiDAR in three dimensions where none is named: a second each
+MOTIONS = ("wheels", "rover")  # of every planar task; the first is a unicycle
+ROVER = MOTIONS[1]
 OPTIONAL: tuple[Part, ...] = (Slip(), Obstacles(), Faults(), Imu())
 
 
@@ -156,6 +159,7 @@ def make(
     texture: float = 0.0,
     hidden_start: bool = False,
     split: str | None = None,
+    motion: str = MOTIONS[0],
     **overrides: Any,
 ) -> tuple[Any, Any]:
     """Make an environment and its params.
@@ -184,6 +188,9 @@ def make(
             the tasks that report a start: `StopAt`, `StopAtShort`, `Return`, `Obstructed` and `Faulted`.
         split: In place of `tunnel`, those of another split of the open world: `train`, `val`, `test-seen` or
             `test-unseen`.
+        motion: `wheels`, a unicycle that does what it is told; or `rover`, a Scout 2.0 with mass by physics in MJX,
+            with the same observations, rewards and ends. Then `engine="mujoco"` computes it in MuJoCo's own C, and
+            `scene=` names the folder of a built scene to do that in.
         **overrides: Entries of `EnvParams` to replace: `horizon=100`, `lidar=LidarParams(range_sigma=0.0)`. `slip`,
             `obstacles`, `faults` and `imu` bring their part to a task that lacks it.
 
@@ -192,12 +199,16 @@ def make(
         are kept on disk from here on, see `cache_programs`.
 
     Raises:
-        ValueError: No such task, no such entry, parts that do not go together, or a value that the simulator cannot
-            honour.
+        ValueError: No such task, motion or entry, a motion that the task does not have, parts that do not go together,
+            or a value that the simulator cannot honour.
         TunnelError: The tunnel file is unreadable or wrong, or has no such lining.
     """
     keep_programs()
     id = find(id)
+    if motion not in MOTIONS or (motion != MOTIONS[0] and id not in TASKS):
+        raise ValueError(f"{id} has no motion {motion!r}; it has {', '.join(MOTIONS) if id in TASKS else 'legs'}")
+    if motion == ROVER and tunnel is None and overrides.get("scene") is not None:
+        tunnel = Path(overrides["scene"]) / "tunnel.npz"
     if id in TASKS:
         tunnel = tunnel_for(id, tunnel, split, spatial=not is_planar(sensor))
     elif split is not None:
@@ -230,7 +241,12 @@ def make(
     brought = (part for part in OPTIONAL if part.name in overrides and part.name not in named)
     env = TunnelEnv(id=id, rule=task.rule, parts=(*own, *brought, *parts), estimates=estimates)
     horizon = _checked_horizon(overrides.pop("horizon", task.horizon))
-    entries = collect_entries(env, {**task.params, **overrides})
+    if motion == ROVER:
+        from subterra_jax.physics import rolling  # MuJoCo is loaded only where physics is meant
+
+        env, entries = rolling.on_rover(env, tunnel, lining, task.piece, {**task.params, **overrides}, hidden_start)
+    else:
+        entries = collect_entries(env, {**task.params, **overrides})
     check_robot(entries)
     reach = c.RANGE_MAX if spatial else float(np.max(entries["lidar"].range_max))
     placed = resolve(tunnel, lining, task.piece, reach, spatial)

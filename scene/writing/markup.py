@@ -10,12 +10,6 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-# What a body touches is chosen by these bits of its geoms' `conaffinity`.
-SOLID = 1  # everything that is really there: lining, bed, sleepers, rails, furniture
-DECK = 2  # a smooth deck at the top of the sleepers, for wheels; not really there
-GROUND = 4  # bed, sleepers and rails alone, for legs
-LOW_WALL = 8  # lining and furniture at robots' height alone, a few panels, so that MJX has few pairs to test
-
 _DIGITS = 5  # behind the point of a coordinate in m
 
 

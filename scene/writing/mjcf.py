@@ -1,7 +1,7 @@
 """The scene as MJCF that MuJoCo and MJX both load.
 
 Meshes are for looks and rays; bodies collide with boxes, since MuJoCo collides a mesh as its convex hull.
-`scene.writing.markup` says which bits of a body's `conaffinity` make it touch what.
+`subterra_jax.host.rover` says which bits of a body's `conaffinity` make it touch what.
 """
 
 import struct
@@ -19,9 +19,6 @@ from scipy.spatial.transform import Rotation
 from scene.bore import Bore
 from scene.writing.furnished import Furnished, FurnitureConfig
 from scene.writing.markup import (
-    DECK,
-    LOW_WALL,
-    SOLID,
     SceneParts,
     add_box,
     add_element,
@@ -34,6 +31,8 @@ from scene.writing.planar import Walls
 from scene.writing.track import Track
 from scene.writing.trackgeoms import add_nails, add_slabs, add_track
 from scene.writing.walls import add_low_panels, add_niche, add_patches
+from subterra_jax.host import rover
+from subterra_jax.host.rover import LOW_WALL, SOLID
 
 _SEGMENTS = 6  # of a ring
 _STONES = 900  # in the picture of the ballast
@@ -101,7 +100,6 @@ _COLOURS = {
     "steel": "0.30 0.24 0.20 1",
     "rail_head": "0.62 0.60 0.58 1",
     "bolt": "0.25 0.22 0.20 1",
-    "scout": "0.90 0.42 0.08 1",
     "concrete_slab": "0.58 0.57 0.54 1",
     "galvanised": "0.62 0.65 0.68 1",
     "cable": "0.06 0.06 0.07 1",
@@ -110,7 +108,7 @@ _COLOURS = {
     "plate": "0.95 0.95 0.92 1",
     "door": "0.16 0.36 0.30 1",
 }
-_SHINY = {"rail_head", "galvanised", "scout"}
+_SHINY = {"rail_head", "galvanised"}
 
 
 def make_root(name: str) -> ET.Element:
@@ -181,25 +179,23 @@ def add_cameras(world: ET.Element, bore: Bore, track: Track) -> None:
         add_element(world, "camera", name=name, pos=format_numbers(position), xyaxes=axes, fovy="65")
 
 
-def add_scout(world: ET.Element, bore: Bore, track: Track, radius: float, lidar_height: float) -> None:
-    """Adds a robot on four smooth casters, 2 m into the bore; its LiDAR is `lidar_height` above the sleepers, m."""
+def add_rover(root: ET.Element, world: ET.Element, bore: Bore, track: Track, lidar_height: float) -> None:
+    """Adds the rover with its motors, 2 m into the bore; its LiDAR is `lidar_height` above the sleepers, m."""
     at = bore.axis.at(np.array([min(2.0, bore.length / 2)]))
     elevation = float(np.interp(at.station[0], bore.station, track.elevation))
     yaw = Rotation.from_euler("z", np.arctan2(at.tangent[0, 1], at.tangent[0, 0]))
-    start = format_numbers([*at.position[0, :2], elevation + 0.01])
-    body = add_element(world, "body", name="scout", pos=start, quat=format_quaternion(yaw))
-    add_element(body, "freejoint", name="scout")
-    touch = {"contype": "0", "conaffinity": str(LOW_WALL | DECK), "group": "2", "material": "scout"}
-    hull = {"type": "capsule", "size": format_numbers([radius, 0.08]), "pos": "0 0 0.52", "mass": "40"}
-    add_element(body, "geom", name="scout_hull", **hull, **touch)
-    for k, (x, y) in enumerate(((1, 1), (1, -1), (-1, 1), (-1, -1))):
-        add_element(
-            body, "geom", name=f"scout_caster_{k}", type="sphere", size="0.08",
-            pos=format_numbers([0.22 * x, 0.22 * y, 0.08]), mass="1", friction="0.05 0.005 0.0001", **touch,
-        )  # fmt: skip
-    add_element(body, "site", name="lidar", pos=format_numbers([0, 0, lidar_height]), size="0.03")
-    add_element(body, "camera", name="scout", pos="0 0 1.0", xyaxes="0 -1 0 0.1 0 1", fovy="70")
-    add_element(body, "camera", name="chase", pos="-4.0 0 2.2", xyaxes="0 -1 0 0.22 0 1", fovy="60")
+    for part in rover.rover_mjcf(lidar_height):
+        if part.tag != "worldbody":
+            root.append(part)
+            continue
+        body = part[0]
+        body.set("pos", format_numbers([*at.position[0, :2], elevation + rover.HEIGHT]))
+        body.set("quat", format_quaternion(yaw))
+        world.append(body)
+    # MJX tests the pairs that are nearest.
+    custom = add_element(root, "custom")
+    for name, most in (("max_geom_pairs", "16"), ("max_contact_points", "24")):
+        add_element(custom, "numeric", name=name, data=most)
 
 
 _NEAR_NICHE = 1.0  # m
@@ -211,7 +207,6 @@ class SceneConfig:
     """Cutting and dressing of the scene."""
 
     chunk_length: float = 20.0  # Length of one mesh of the lining, m.
-    robot_radius: float = 0.4  # Radius of the scout, m.
     lidar_height: float = 0.7  # Height of its LiDAR above the top of the sleepers, m.
     furniture: FurnitureConfig = field(default_factory=FurnitureConfig)  # Furniture of the variant `furnished`.
 
@@ -254,7 +249,7 @@ def write_scene(
         _add_furniture(world, furnished)
     count["lights"] = add_lights(world, bore, track, config.furniture.lamp_spacing)
     add_cameras(world, bore, track)
-    add_scout(world, bore, track, config.robot_radius, config.lidar_height)
+    add_rover(root, world, bore, track, config.lidar_height)
     ET.indent(root)
     path = folder / ("scene_furnished.xml" if furnished else "scene.xml")
     path.write_text(ET.tostring(root, encoding="unicode") + "\n")

@@ -1,4 +1,4 @@
-"""The track as meshes and geoms: bed, deck, sleepers, rails, fastenings, nails."""
+"""The track as meshes and geoms: bed, sleepers, rails, fastenings, nails."""
 
 from xml.etree import ElementTree as ET
 
@@ -10,10 +10,11 @@ from scipy.spatial.transform import Rotation
 from scene.bore import Bore
 from scene.geometry import Axis
 from scene.writing import markup
-from scene.writing.markup import DECK, GROUND, SOLID, SceneParts, add_box, add_element
+from scene.writing.markup import SceneParts, add_box, add_element
 from scene.writing.mesh import join_meshes
 from scene.writing.track import Line, RailProfile, Track, TrackConfig
 from scene.writing.unrolled import wall_points
+from subterra_jax.host.rover import GROUND, RAIL, ROLL, SOLID
 
 # Engineering defaults, not sourced: plan size of a pad; cast shoulder; a clip of 20 mm bar, e-shaped from above, from
 # its leg in the shoulder to its toe on the rail's foot, as x along the rail, y away from the foot's edge, z above it.
@@ -110,20 +111,19 @@ _RAIL_LENGTH = 3.0  # m: the chord of a bend of 150 m is off by 7 mm
 
 
 def add_slabs(world: ET.Element, bore: Bore, track: Track) -> None:
-    """Adds the bed (visible where it is a slab) and the deck, in straight pieces along the grade."""
+    """Adds the bed, visible where it is a slab, in straight pieces along the grade."""
     axis = bore.axis
     station = np.linspace(0.0, bore.length, max(int(np.ceil(bore.length / _SLAB_LENGTH)), 1) + 1)
     at = axis.at(station)
     half = track.config.sleeper_length / 2 + track.config.shoulder if track.raised else float(bore.width.max()) / 2
-    for name, level, bits in (("bed", track.bed, SOLID | GROUND), ("deck", track.elevation, DECK)):
-        top = at.position.copy()
-        top[:, 2] = np.interp(station, bore.station, level)
-        seen = {"group": "0", "material": "ballast"} if name == "bed" and track.raised else {"group": "3"}
-        for k in range(len(station) - 1):
-            rotation = markup.rotation_along(top[k], top[k + 1])
-            middle = (top[k] + top[k + 1]) / 2 - rotation.apply([0, 0, _SLAB_THICKNESS / 2])
-            half_size = np.array([np.linalg.norm(top[k + 1] - top[k]) / 2 + 0.02, half, _SLAB_THICKNESS / 2])
-            add_box(world, f"{name}_{k:03d}", half_size, middle, rotation, bits, **seen)
+    top = at.position.copy()
+    top[:, 2] = np.interp(station, bore.station, track.bed)
+    seen = {"group": "0", "material": "ballast"} if track.raised else {"group": "3"}
+    for k in range(len(station) - 1):
+        rotation = markup.rotation_along(top[k], top[k + 1])
+        middle = (top[k] + top[k + 1]) / 2 - rotation.apply([0, 0, _SLAB_THICKNESS / 2])
+        half_size = np.array([np.linalg.norm(top[k + 1] - top[k]) / 2 + 0.02, half, _SLAB_THICKNESS / 2])
+        add_box(world, f"bed_{k:03d}", half_size, middle, rotation, SOLID | GROUND | ROLL, **seen)
 
 
 def add_track(parts: SceneParts, axis: Axis, track: Track) -> None:
@@ -162,7 +162,7 @@ def _add_sleepers(parts: SceneParts, axis: Axis, line: Line, mark: str) -> None:
         }
         add_element(
             parts.world, "geom", name=f"sleeper_{mark}{k:04d}", type="mesh", mesh="sleeper", material="sleeper",
-            contype=str(SOLID | GROUND), **place,
+            contype=str(SOLID | GROUND | ROLL), **place,
         )  # fmt: skip
         add_element(
             parts.world, "geom", name=f"fastening_{mark}{k:04d}", type="mesh", mesh=f"fastening{mark.rstrip('_')}",
@@ -209,4 +209,4 @@ def _add_rails(world: ET.Element, axis: Axis, line: Line, config: TrackConfig, m
                 material = "rail_head" if part == "head" else "steel"
                 size = (half, width / 2, (high - low) / 2)
                 name_part = f"rail_{name}_{mark}{k:03d}_{part}"
-                add_box(world, name_part, size, middle, rotation, SOLID | GROUND, group="1", material=material)
+                add_box(world, name_part, size, middle, rotation, SOLID | GROUND | RAIL, group="1", material=material)

@@ -14,9 +14,10 @@ from shapely import LineString, Point
 
 from scene.bore import Bore
 from scene.geometry import arc_length
-from scene.writing.markup import LOW_WALL, SOLID, add_box, cross_product, rotation_along
+from scene.writing.markup import add_box, cross_product, rotation_along
 from scene.writing.planar import Walls
 from scene.writing.track import Track
+from subterra_jax.host.rover import LOW_WALL, SOLID
 
 _PATCH_TOLERANCE = 0.015  # of a patch from its wall, m
 _STRETCH = 6.0  # longest patch, m

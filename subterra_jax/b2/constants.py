@@ -66,7 +66,6 @@ def inertial(leg: str, part: str) -> Inertial:
 
 
 GRAVITY = 9.81  # m/s²
-TIMESTEP = 0.004  # of the physics, s
 FOOT_FRICTION = 0.8  # on any material; rubber on concrete, where the MJCFs say 0.4
 
 # Geometry, m.
@@ -106,6 +105,6 @@ STAND_HEIGHT = 0.5435  # of the trunk's middle over the feet's soles in that pos
 
 # Frame in the trunk's frame, m.
 LIDAR = (0.34218, 0.0, 0.17851)
-
-# Bits of `contype` and `conaffinity`, as docs/formats.md gives them for scene.xml.
-GROUND, LOW_WALL = 4, 8
+# Balls at either end of the trunk that are kept out of walls; together they are the envelope in plan, m.
+BUMPER_X, BUMPER_RADIUS = 0.33, 0.225
+BUMPERS = ("bumper_front", "bumper_rear")

@@ -8,11 +8,9 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from subterra_jax.b2 import constants as b2
 from subterra_jax.b2.gait import standing_gait
-from subterra_jax.b2.kinematics import compose, rotate, standing_pose, yaw_quaternion
+from subterra_jax.b2.kinematics import standing_pose
 from subterra_jax.b2.observation import TrackPose, locate, measure
 from subterra_jax.b2.params import (
-    Body,
-    Build,
     CommandParams,
     RandomisationParams,
     WalkParams,
@@ -20,6 +18,8 @@ from subterra_jax.b2.params import (
     WalkState,
     WalkStepNoise,
 )
+from subterra_jax.physics.engine import Body, Build
+from subterra_jax.physics.rotations import compose, rotate, yaw_quaternion
 
 _LATERAL, _HEADING, _MARGIN = 0.2, 0.2, 25.0  # of starts: m, rad, m
 _TURN, _SIDESTEP, _AIM, _FREE = 1.5, 1.0, 1.5, 0.5  # of steering: 1/s, 1/s, rad/m, rad

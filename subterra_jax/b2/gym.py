@@ -11,9 +11,9 @@ from subterra_jax.adapters.kernel import first_cpu
 from subterra_jax.adapters.single import SubterraEnv
 from subterra_jax.adapters.task import Task, check_mode
 from subterra_jax.b2 import tasks
-from subterra_jax.b2.engine import MujocoPhysics, walk_in_scene
-from subterra_jax.b2.view import RobotView
 from subterra_jax.host.task_ids import B2_TRAVERSE, WALK
+from subterra_jax.physics.stage import scene_file
+from subterra_jax.physics.view import RobotView
 from subterra_jax.pictures.camera import TunnelChoice
 from subterra_jax.tunnel.plan import TunnelPlan
 
@@ -38,7 +38,7 @@ class B2Env(SubterraEnv):
         render_mode: `None` or `rgb_array`.
         width: Width of a picture, pixels.
         height: Height of a picture, pixels.
-        **options: As for `tasks.make_mission`: `policy`, `odometer`, `sensor` and so on.
+        **options: As for `tasks.make_mission`: `policy`, `sensor` and so on.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 5}  # noqa: RUF012  as Gymnasium declares it
@@ -58,8 +58,10 @@ class B2Env(SubterraEnv):
         check_mode(render_mode)
         with jax.default_device(first_cpu()):
             env, params = self._make(task, tunnel, lining, scene, options)
-        self.walk, walking = (env.motion.walk, params.walk) if task != WALK else (env, params)
-        self.camera = RobotView(self.walk, walking, TunnelChoice(tunnel, lining), width, height)
+        self.walk = env if task == WALK else env.motion.walk
+        file = None if scene is None else scene_file(scene, lining)
+        choice = TunnelChoice(tunnel, lining)
+        self.camera = RobotView(self.walk.physics, params.track, choice, file, width, height)
         self._adopt(Task(env, params, flat=task == WALK, compile=compile_for_cpu), self.camera, render_mode)
 
     def _make(self, task: str, tunnel: Any, lining: str | None, scene: Any, options: dict[str, Any]) -> tuple[Any, Any]:
@@ -81,5 +83,4 @@ class B2WalkEnv(B2Env):
         super().__init__(task, *args, **options)
 
     def _make(self, task: str, tunnel: Any, lining: str | None, scene: Any, options: dict[str, Any]) -> tuple[Any, Any]:
-        env, params = tasks.make(task, tunnel, lining, scene=scene, physics=MujocoPhysics(), **options)
-        return env if scene is None else walk_in_scene(env, Path(scene), lining), params
+        return tasks.make(task, tunnel, lining, scene=scene, engine="mujoco", **options)

@@ -1,6 +1,6 @@
-"""Rotations, and the kinematics of the four legs in closed form.
+"""The kinematics of the four legs in closed form.
 
-Products are written out: a `dot` may round to TF32 on a GPU. Quaternions have the real part first. Legs are in the
+Products are written out: a `dot` may round to TF32 on a GPU. Legs are in the
 order of `constants.LEGS`, joints in that of `constants.PARTS`. Feet are points in the trunk's axes, measured from
 their leg's abduction axis.
 """
@@ -11,48 +11,11 @@ from jaxtyping import Array, Float
 
 from subterra_jax.b2 import constants as b2
 
-Quaternion = Float[Array, "4"]
-
 SIDE = np.array([1.0, -1.0, 1.0, -1.0], np.float32)  # left is positive
 END = np.array([1.0, 1.0, -1.0, -1.0], np.float32)  # front is positive
 HIPS = np.stack([END * b2.HIP_X, SIDE * b2.HIP_Y, 0.0 * SIDE], axis=1)  # abduction axes in the trunk, m
 STIFFNESS = np.array([b2.JOINT[part].stiffness for part in b2.PARTS], np.float32)  # of a leg's servos, N m/rad
 _REACH = (0.12, 0.695)  # between a thigh's axis and its foot, m: short of folded and of straight
-
-
-def rotate(quaternion: Quaternion, vector: Float[Array, "3"]) -> Float[Array, "3"]:
-    """Rotates a vector from the turned frame into the outer frame."""
-    w, x, y, z = quaternion
-    a, b, c = vector
-    # v + 2 w (r × v) + 2 r × (r × v)
-    s, t, u = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)
-    return jnp.stack([a + w * s + y * u - z * t, b + w * t + z * s - x * u, c + w * u + x * t - y * s])
-
-
-def inverse(quaternion: Quaternion) -> Quaternion:
-    """Return the inverse of a unit quaternion."""
-    w, x, y, z = quaternion
-    return jnp.stack([w, -x, -y, -z])
-
-
-def compose(first: Quaternion, second: Quaternion) -> Quaternion:
-    """Return the rotation `second` within the frame turned by `first`."""
-    a, b, c, d = first
-    w, x, y, z = second
-    return jnp.stack(
-        [
-            a * w - b * x - c * y - d * z,
-            a * x + b * w + c * z - d * y,
-            a * y - b * z + c * w + d * x,
-            a * z + b * y - c * x + d * w,
-        ]
-    )
-
-
-def yaw_quaternion(angle: Float[Array, ""]) -> Quaternion:
-    """Return a rotation about z by an angle, rad."""
-    zero = jnp.zeros_like(angle)
-    return jnp.stack([jnp.cos(0.5 * angle), zero, zero, jnp.sin(0.5 * angle)])
 
 
 def foot_positions(angles: Float[Array, "4 3"]) -> Float[Array, "4 3"]:

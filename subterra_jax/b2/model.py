@@ -1,19 +1,15 @@
-"""The B2 as MJCF, written from its constants: position servos, a trunk that touches walls and feet on the ground."""
+"""The B2 as MJCF, written from its constants: position servos, bumpers that touch walls and feet on the ground."""
 
 import mujoco
 
 from subterra_jax.b2 import constants as b2
-from subterra_jax.b2.kinematics import standing_pose
 from subterra_jax.b2.shape import shape_of
-from subterra_jax.host.errors import SubterraError
+from subterra_jax.host.rover import GROUND, LOW_WALL
+from subterra_jax.physics.engine import TIMESTEP, Machine
 
 _BOX, _SPHERE = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_SPHERE
 _ROBOT, _HIDDEN = 2, 3  # groups of what is drawn and of what MuJoCo does not draw unless asked to
 _SHELL, _LIMB = (0.30, 0.31, 0.33, 1.0), (0.16, 0.16, 0.17, 1.0)
-
-
-class RobotError(SubterraError):
-    """The robot cannot be built as asked."""
 
 
 def robot_spec() -> mujoco.MjSpec:
@@ -31,30 +27,17 @@ def robot_spec() -> mujoco.MjSpec:
     return spec
 
 
-def add_stand(spec: mujoco.MjSpec) -> None:
-    """Adds the key frame `stand`: the default pose on a ground at z = 0, with the targets that hold it.
-
-    Call this last: a key frame has the sizes of the model at that moment.
-    """
-    pose, hold = standing_pose()
-    spec.add_key(name="stand", qpos=[0.0, 0.0, b2.STAND_HEIGHT, 1.0, 0.0, 0.0, 0.0, *pose.tolist()], ctrl=hold.tolist())
-
-
-def dress(spec: mujoco.MjSpec, prefix: str = "") -> None:
+def dress(spec: mujoco.MjSpec) -> None:
     """Adds the robot's looks for pictures, as meshes that touch and weigh nothing, and hides its primitives.
 
     Physics never sees this model, and would give the same bits with it.
-
-    Args:
-        spec: A model with the robot in it.
-        prefix: Prefix of the robot's names.
     """
     for name in ("base_link", *(f"{leg}_{part}" for leg in b2.LEGS for part in b2.PARTS)):
-        body = spec.body(f"{prefix}{name}")
+        body = spec.body(name)
         for geom in body.geoms:
             geom.group = _HIDDEN
         for k, part in enumerate(shape_of(name)):
-            own = f"{prefix}{name} {k}"
+            own = f"{name} {k}"
             mesh = spec.add_mesh(name=own, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
             mesh.uservert, mesh.userface = part.vertices.ravel().tolist(), part.faces.ravel().tolist()
             body.add_geom(
@@ -66,7 +49,7 @@ def dress(spec: mujoco.MjSpec, prefix: str = "") -> None:
 def _set_options(spec: mujoco.MjSpec) -> None:
     """Sets one Newton iteration with a short line search, warm-started: enough for contacts of the feet."""
     option = spec.option
-    option.timestep, option.iterations, option.ls_iterations = b2.TIMESTEP, 1, 5
+    option.timestep, option.iterations, option.ls_iterations = TIMESTEP, 1, 5
     option.integrator, option.cone = mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtCone.mjCONE_PYRAMIDAL
     # The servos damp within the torque limit: an implicit step would not help.
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
@@ -92,7 +75,7 @@ def _add_leg(spec: mujoco.MjSpec, trunk: mujoco.MjsBody, leg: str) -> None:
     body.add_site(name=f"{leg}_foot", pos=(0.0, 0.0, -b2.LINK), size=(0.01,) * 3, group=4)
     body.add_geom(
         name=f"{leg}_foot", type=_SPHERE, pos=(0.0, 0.0, -b2.LINK), size=(b2.FOOT_RADIUS, 0.0, 0.0), mass=0.0,
-        contype=0, conaffinity=b2.GROUND, condim=3, priority=1, friction=(b2.FOOT_FRICTION, 0.005, 0.0001),
+        contype=0, conaffinity=GROUND, condim=3, priority=1, friction=(b2.FOOT_FRICTION, 0.005, 0.0001),
         group=_ROBOT, rgba=_LIMB,
     )  # fmt: skip
 
@@ -110,8 +93,14 @@ def _add_joint(spec: mujoco.MjSpec, body: mujoco.MjsBody, leg: str, part: str) -
 
 
 def _add_trunk_geom(trunk: mujoco.MjsBody) -> None:
-    """Adds the collision box of the URDF, the only part of the trunk that touches anything."""
+    """Adds the collision box of the URDF, for looks, and the bumpers, which alone touch anything."""
     size = (0.25, 0.14, 0.075)
-    trunk.add_geom(
-        name="trunk", type=_BOX, size=size, mass=0.0, contype=0, conaffinity=b2.LOW_WALL, group=_ROBOT, rgba=_SHELL
-    )
+    trunk.add_geom(name="trunk", type=_BOX, size=size, mass=0.0, contype=0, conaffinity=0, group=_ROBOT, rgba=_SHELL)
+    for name, end in zip(b2.BUMPERS, (1.0, -1.0), strict=True):
+        trunk.add_geom(
+            name=name, type=_SPHERE, pos=(end * b2.BUMPER_X, 0.0, 0.0), size=(b2.BUMPER_RADIUS, 0.0, 0.0), mass=0.0,
+            contype=0, conaffinity=LOW_WALL, condim=1, group=_HIDDEN,
+        )  # fmt: skip
+
+
+B2 = Machine(robot_spec, "base_link", tuple(f"{leg}_foot" for leg in b2.LEGS), b2.BUMPERS, dress=dress)

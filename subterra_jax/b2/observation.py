@@ -6,9 +6,10 @@ from jaxtyping import Array, Float
 
 from subterra_jax.b2 import gait, kinematics
 from subterra_jax.b2.gait import GaitParams, GaitState
-from subterra_jax.b2.kinematics import inverse, rotate
-from subterra_jax.b2.params import Body, Proprioception, SensorParams, WalkState
-from subterra_jax.b2.track import SPACING, Track
+from subterra_jax.b2.params import Proprioception, SensorParams, WalkState
+from subterra_jax.physics.engine import Body
+from subterra_jax.physics.ground import SPACING, Track
+from subterra_jax.physics.rotations import inverse, rotate
 
 _FOLLOW = 0.35  # share of a new reading in the smoothed speed
 _FIELDS = {

@@ -4,7 +4,8 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from subterra_jax.b2.gait import GaitParams, GaitState
-from subterra_jax.b2.track import Track
+from subterra_jax.physics.engine import Body, Build
+from subterra_jax.physics.ground import Track
 from subterra_jax.tunnel import Tunnel
 
 Range = Array | tuple[float, float]
@@ -132,57 +133,6 @@ class WalkParams:
 
 
 @struct.dataclass
-class Body:
-    """State of the physics; positions from the anchor.
-
-    Attributes:
-        qpos: Trunk's position (m) and quaternion, joint angles (rad).
-        qvel: Trunk's velocity (m/s, world axes) and rates (rad/s, its own axes), joint speeds (rad/s).
-        warmstart: Accelerations of the last step, from which the solver starts.
-    """
-
-    qpos: Float[Array, "19"]
-    qvel: Float[Array, "18"]
-    warmstart: Float[Array, "18"]
-
-
-@struct.dataclass
-class Build:
-    """Properties of one robot, as drawn by domain randomisation.
-
-    Attributes:
-        friction: Friction of the feet.
-        mass: Factor on every mass and inertia.
-        shift: Shift of the trunk's centre of mass, m.
-        stiffness: Factor on each servo's stiffness.
-        damping: Factor on each servo's damping.
-    """
-
-    friction: Float[Array, ""]
-    mass: Float[Array, ""]
-    shift: Float[Array, "3"]
-    stiffness: Float[Array, "12"]
-    damping: Float[Array, "12"]
-
-
-@struct.dataclass
-class Surroundings:
-    """Ground and walls that the robot may touch in one control period, from the anchor.
-
-    Attributes:
-        ground: Positions and quaternions of the window's mocap bodies.
-        quaternion: Rotation of the anchor: x along the track.
-        half_width: Half the distance between the walls, m.
-        origin: Position of the anchor, tunnel frame, m; the window does not need it.
-    """
-
-    ground: tuple[Float[Array, "n_mocap 3"], Float[Array, "n_mocap 4"]]
-    quaternion: Float[Array, "4"]
-    half_width: Float[Array, ""]
-    origin: Float[Array, "3"] | None = None
-
-
-@struct.dataclass
 class Proprioception:
     """Readings of the robot's own sensors, with noise.
 
@@ -207,7 +157,7 @@ class WalkState:
 
     Attributes:
         body: State of the physics.
-        anchor: Index of the sleeper nearest to the robot.
+        anchor: Row of the track nearest to the robot.
         gait: State of the gait.
         command: Commanded velocity forward and to the left (m/s), and yaw rate (rad/s).
         drawn_command: Command as drawn, before it is changed to keep the robot between the rails.

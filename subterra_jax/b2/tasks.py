@@ -5,18 +5,14 @@ from pathlib import Path
 from typing import Any, Literal
 
 import jax.numpy as jnp
-import numpy as np
 
 from subterra_jax.b2 import constants as b2
-from subterra_jax.b2.engine import MujocoPhysics, walk_in_scene
 from subterra_jax.b2.gait import RELEASED, GaitParams, WalkPolicy, check_fits, load_policy
-from subterra_jax.b2.mission import PERIODS, LegOdometer, Legs, TrunkLidar, TrunkSpatialLidar
-from subterra_jax.b2.model import RobotError
+from subterra_jax.b2.mission import PERIODS, Legs
+from subterra_jax.b2.model import B2
 from subterra_jax.b2.params import CommandParams, RandomisationParams, SensorParams, WalkParams, WalkRewardParams
-from subterra_jax.b2.physics import Physics
-from subterra_jax.b2.track import Track, lay_standard_track, read_scene_track
 from subterra_jax.b2.walk import WalkEnv
-from subterra_jax.constants import DISTANCE_BIAS_SIGMA, RANGE_MAX
+from subterra_jax.constants import RANGE_MAX
 from subterra_jax.host.task_ids import B2_TRAVERSE, MISSIONS, WALK
 from subterra_jax.lidar3d.relief import Relief
 from subterra_jax.params import check_together, collect_entries, make_params
@@ -24,6 +20,10 @@ from subterra_jax.parts import Odometer
 from subterra_jax.parts.odometer import OdometryParams
 from subterra_jax.parts.spatial_lidar import SENSORS, SpatialParams, make_sensor
 from subterra_jax.parts.unicycle import VehicleParams
+from subterra_jax.physics.engine import Engine, MujocoEngine
+from subterra_jax.physics.ground import read_track
+from subterra_jax.physics.riding import SwayingLidar, SwayingSpatialLidar
+from subterra_jax.physics.rolling import ENGINES, check_width, world_of
 from subterra_jax.rules import StartParams, Traverse
 from subterra_jax.state import EnvParams, as_arrays
 from subterra_jax.tunnel import Tunnel
@@ -31,10 +31,7 @@ from subterra_jax.tunnel.plan import TunnelPlan
 from subterra_jax.tunnel.sources import load_tunnel, resolve
 from subterra_jax.tunnel_env import TunnelEnv
 
-_MARGIN = 0.1  # to either side of the robot's envelope, m
-
 TROT = "trot"  # the scripted gait, without a trained policy
-ENGINES = ("mjx", "mujoco")
 
 # Five commands a second, within the velocities for which the gait was trained.
 VEHICLE = VehicleParams(speed_max=0.8, yaw_rate_max=0.8, radius=0.4, period=0.2)
@@ -49,7 +46,8 @@ def make(
     lining: str | None = None,
     *,
     scene: str | Path | None = None,
-    physics: Physics | None = None,
+    engine: Literal["mjx", "mujoco"] = "mjx",
+    physics: Engine | None = None,
     driven: bool = False,
     privileged: bool = False,
     **overrides: Any,
@@ -58,11 +56,13 @@ def make(
 
     Args:
         id: `Subterra/B2Walk-v1`.
-        tunnel: A tunnel file, a name as for `load_tunnel`, or a plan; None is the packaged tunnel. Sleepers are laid
-            by standard.
+        tunnel: A tunnel file, a name as for `load_tunnel`, or a plan; None is the packaged tunnel. The robot walks on
+            its sleepers as measured, or on its floor where it has none.
         lining: Variant of the walls; None is `pockets`, or the first where a tunnel has none.
-        scene: A built scene folder, whose tunnel and sleepers are taken; instead of `tunnel`.
-        physics: The robot and its window of track; the defaults if left out.
+        scene: A built scene folder, whose tunnel is taken; instead of `tunnel`.
+        engine: `mjx`, for thousands on a GPU; or `mujoco`, in C on the host, for a few: in `scene.xml` where there is a
+            scene.
+        physics: An engine of one's own with the robot, instead.
         driven: As for `WalkEnv`.
         privileged: As for `WalkEnv`.
         **overrides: Fields of `WalkParams` to replace.
@@ -70,15 +70,21 @@ def make(
     Raises:
         ValueError: No such task or field, or both a tunnel and a scene.
         TunnelError: The tunnel file is unreadable or wrong, or has no such lining.
-        TrackError: The scene has no track.
+        TrackError: The tunnel is too short, or there is no such scene.
         RobotError: The tunnel is narrower than the robot.
     """
     if id != WALK:
         raise ValueError(f"no walking task {id!r}; there is {WALK}")
     if scene is not None and tunnel is not None:
         raise ValueError(f"either a tunnel or a scene, got both {str(tunnel)!r} and {str(scene)!r}")
-    plan, track = _load_track(tunnel, scene)
-    check_width(plan)
+    if engine not in ENGINES:
+        raise ValueError(f"no engine {engine!r}; there are {', '.join(ENGINES)}")
+    plan = _load(tunnel, scene)
+    check_width(plan, b2.ENVELOPE[1], "B2")
+    track = read_track(plan)
+    if physics is None:
+        world = world_of(plan, track, lining, scene) if engine == "mujoco" else None
+        physics = Engine(B2) if world is None else MujocoEngine(B2, world=world)
     known = {field.name for field in dataclasses.fields(WalkParams)} - {"tunnel", "track"}
     if unknown := set(overrides) - known:
         raise ValueError(f"no field {sorted(unknown)} in WalkParams; there are {sorted(known)}")
@@ -91,26 +97,14 @@ def make(
         **overrides,
     }
     params = WalkParams(tunnel=Tunnel.from_plan(plan, lining), track=track, **fields)
-    env = WalkEnv(id=id, physics=physics or Physics(), driven=driven, privileged=privileged)
+    env = WalkEnv(id=id, physics=physics, driven=driven, privileged=privileged)
     return env, as_arrays(params)
 
 
-def check_width(plan: TunnelPlan) -> None:
-    """Raises `RobotError` where a tunnel is narrower than the robot with 0.1 m to either side."""
-    needed, narrowest = b2.ENVELOPE[1] + 2.0 * _MARGIN, int(np.argmin(plan.half_width))
-    if (width := 2.0 * float(plan.half_width[narrowest])) < needed:
-        raise RobotError(
-            f"tunnel {plan.name!r} is {width:.2f} m wide at {plan.station[narrowest]:.1f} m; "
-            f"the B2 needs {needed:.2f} m"
-        )
-
-
-def _load_track(tunnel: TunnelPlan | str | Path | None, scene: str | Path | None) -> tuple[TunnelPlan, Track]:
+def _load(tunnel: TunnelPlan | str | Path | None, scene: str | Path | None) -> TunnelPlan:
     if scene is not None:
-        plan = load_tunnel(Path(scene) / "tunnel.npz")
-        return plan, read_scene_track(Path(scene), plan)
-    plan = tunnel if isinstance(tunnel, TunnelPlan) else load_tunnel(tunnel)
-    return plan, lay_standard_track(plan)
+        return load_tunnel(Path(scene) / "tunnel.npz")
+    return tunnel if isinstance(tunnel, TunnelPlan) else load_tunnel(tunnel)
 
 
 def make_mission(
@@ -121,7 +115,6 @@ def make_mission(
     scene: str | Path | None = None,
     policy: WalkPolicy | str | Path = RELEASED,
     engine: Literal["mjx", "mujoco"] = "mjx",
-    odometer: Literal["legs", "drift"] = "legs",
     relief: Relief | None = None,
     walk: dict[str, Any] | None = None,
     sensor: Any = SENSORS[0],
@@ -138,7 +131,6 @@ def make_mission(
             `engine="mujoco"` in `scene.xml` itself; the LiDAR sees all of its triangles.
         policy: The gait: a policy, its file or name, or `trot`.
         engine: `mjx`, for thousands on a GPU; or `mujoco`, in C on the host, for a few.
-        odometer: `legs`, the robot's own; or `drift`, the model of the planar tasks applied to its true motion.
         relief: Surface that the LiDAR sees; that of the scene, if any, if left out.
         walk: Fields of `WalkParams` to replace.
         sensor: The LiDAR on the trunk, as for `subterra_jax.make`.
@@ -146,21 +138,19 @@ def make_mission(
         **overrides: Fields of `EnvParams` to replace.
 
     Raises:
-        ValueError: No such task, engine, odometer or field.
+        ValueError: No such task, engine or field.
         TunnelError: The tunnel file is unreadable or wrong, or has no such lining.
-        TrackError: The scene has no track.
+        TrackError: The tunnel is too short, or there is no such scene.
         RobotError: The tunnel is narrower than the robot.
         PolicyError: There is no such gait, or it does not fit the robot.
     """
-    _check_choices(id, engine, odometer)
+    if id not in MISSIONS:
+        raise ValueError(f"no task {id!r}; there are {', '.join(MISSIONS)}")
     # No pushes on the way.
     parts = {"randomisation": RandomisationParams(push=0.0), "sensor": SensorParams(), **(walk or {})}
-    physics = MujocoPhysics() if engine == "mujoco" else Physics()
-    walker, walking = make(WALK, tunnel, lining, scene=scene, physics=physics, driven=True, **parts)
+    walker, walking = make(WALK, tunnel, lining, scene=scene, engine=engine, driven=True, **parts)
     if scene is not None:
         relief = relief or Relief.from_plan(load_tunnel(Path(scene) / "tunnel.npz"), lining)
-        if engine == "mujoco":
-            walker = walk_in_scene(walker, Path(scene), lining)
     spatial = not (isinstance(sensor, str) and sensor == SENSORS[0])
     if spatial:
         made = sensor if isinstance(sensor, SpatialParams) else make_sensor(sensor)
@@ -171,33 +161,24 @@ def make_mission(
         source = tunnel if scene is None else Path(scene) / "tunnel.npz"
         walking = dataclasses.replace(walking, tunnel=resolve(source, lining, None, RANGE_MAX, spatial=True))
     trained = _gait(policy, walker.observation_size(walking))
-    own = {"walk": walking, "policy": trained, "relief": relief}
-    env = TunnelEnv(
-        id=id,
-        rule=Traverse(),
-        parts=(LegOdometer() if odometer == "legs" else Odometer(), TrunkSpatialLidar() if spatial else TrunkLidar()),
-        motion=Legs(walker),
-    )
+    own = {"walk": walking, "track": walking.track, "policy": trained, "relief": relief}
+    legs = Legs(walk=walker)
+    lidar = SwayingSpatialLidar(motion=legs) if spatial else SwayingLidar(motion=legs)
+    env = TunnelEnv(id=id, rule=Traverse(), parts=(Odometer(), lidar), motion=legs)
     fields: dict[str, Any] = {
         "vehicle": VEHICLE,
-        "odometry": OdometryParams(distance_bias_sigma=0.0 if odometer == "legs" else DISTANCE_BIAS_SIGMA),
+        "odometry": OdometryParams(distance_sigma=0.0, distance_bias_sigma=0.0, heading_sigma=0.0),
         "start": START,
     }
     if given := set(own) & set(overrides):
-        raise ValueError(f"{env.id} has no {sorted(given)} to replace; `walk=`, `policy=` and `relief=` make them")
+        raise ValueError(
+            f"{env.id} has no {sorted(given)} to replace; `tunnel=`, `walk=`, `policy=` and `relief=` make them"
+        )
     horizon = overrides.pop("horizon", HORIZON)
     params = make_params(env, walking.tunnel, horizon, collect_entries(env, {**fields, **own, **overrides}))
     check_together(env, params)
-    _check_period(params, PERIODS * physics.period)
+    _check_period(params, PERIODS * walker.physics.period)
     return env, params
-
-
-def _check_choices(id: str, engine: str, odometer: str) -> None:
-    for name, value, known in (("task", id, MISSIONS), ("engine", engine, ENGINES)):
-        if value not in known:
-            raise ValueError(f"no {name} {value!r}; there are {', '.join(known)}")
-    if odometer not in ("legs", "drift"):
-        raise ValueError(f"odometer must be 'legs' or 'drift', got {odometer!r}")
 
 
 def _check_period(params: EnvParams, commanded: float) -> None:

@@ -8,13 +8,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from subterra_jax.b2 import constants as b2
-from subterra_jax.b2 import draws, gait, kinematics, observation, track
+from subterra_jax.b2 import draws, gait, observation
+from subterra_jax.b2.model import B2
 from subterra_jax.b2.observation import gravity_direction, locate, true_velocity
-from subterra_jax.b2.params import Body, Build, Surroundings, WalkParams, WalkResetNoise, WalkState, WalkStepNoise
-from subterra_jax.b2.physics import BUMPER_RADIUS, BUMPERS, Physics
+from subterra_jax.b2.params import WalkParams, WalkResetNoise, WalkState, WalkStepNoise
 from subterra_jax.env import Box, Info
-from subterra_jax.parts.unicycle import clearance
-from subterra_jax.tunnel import at_station
+from subterra_jax.physics.engine import Body, Build, Engine
+from subterra_jax.physics.riding import Ride, advance_period
 
 N_ACTION = 12
 _STIFFNESS, _DAMPING, _TORQUE = (
@@ -36,13 +36,13 @@ class WalkEnv:
 
     Attributes:
         id: The Gymnasium id.
-        physics: The robot on its window of track.
+        physics: The engine with the robot.
         driven: Whether commands are set from outside, in the state, instead of drawn.
         privileged: Whether the observation ends with the truth for a critic.
     """
 
     id: str = "Subterra/B2Walk-v1"
-    physics: Physics = dataclasses.field(default_factory=Physics)
+    physics: Engine = dataclasses.field(default_factory=lambda: Engine(B2))
     driven: bool = False
     privileged: bool = False
 
@@ -106,15 +106,12 @@ class WalkEnv:
         period = self.physics.period
         action = jnp.clip(jnp.where(jnp.isnan(action), 0.0, action), -1.0, 1.0)
         gait_state, targets = command_joints(state, action, period, params)
-        around = self.surroundings(state, params)
-        body = self.physics.run(_push(state.body, noise, period, params), targets, around, state.build)
-        finite = jnp.all(jnp.isfinite(body.qpos)) & jnp.all(jnp.isfinite(body.qvel))
-        body = jax.tree.map(lambda new, old: jnp.where(finite, new, old), body, state.body)
-        anchor, position = track.move_anchor(params.track, state.anchor, body.qpos[:3])
-        body = dataclasses.replace(body, qpos=body.qpos.at[:3].set(position))
+        pushed = Ride(_push(state.body, noise, period, params), state.anchor)
+        ride, _, clear, wrong = advance_period(self.physics, pushed, targets, state.build, params.track, params.tunnel)
+        body, anchor = ride.body, ride.anchor
         pose = locate(body, params.track.quaternion[anchor])
         upright = -gravity_direction(body)[2]
-        fallen = ~finite | (pose.height < params.fall_height) | (upright < jnp.cos(params.fall_tilt))
+        fallen = wrong | (pose.height < params.fall_height) | (upright < jnp.cos(params.fall_tilt))
         torque = servo_torques(body, targets, state.build)
         terms = reward_terms(body, gait_state, torque, action, state.action, fallen, params, period)
         station = params.track.station[anchor] + pose.ahead
@@ -136,7 +133,6 @@ class WalkEnv:
         if not self.driven:
             drawn, command = draws.next_command(state, pose, noise, period, params)
             after = dataclasses.replace(after, drawn_command=drawn, command=command)
-        clear = self._clearance(after, station, params)
         info = {
             **terms,
             "station": station,
@@ -144,7 +140,7 @@ class WalkEnv:
             "height": pose.height,
             "coverage": jnp.clip(furthest / params.tunnel.length, 0.0, 1.0),
             "clearance": clear,
-            "contact": clear < BUMPER_RADIUS,
+            "contact": clear < self.physics.reach,
             "fall": fallen,
             "success": expired & ~fallen,
             "velocity": true_velocity(body),
@@ -160,27 +156,8 @@ class WalkEnv:
         own = observation.observe_self(state)
         return jnp.concatenate([own, observation.observe_truth(state, params.track)]) if self.privileged else own
 
-    def surroundings(self, state: WalkState, params: WalkParams) -> Surroundings:
-        """Return the ground and walls that the robot may touch in the next control period."""
-        sleepers, anchor = params.track, state.anchor
-        pose = locate(state.body, sleepers.quaternion[anchor])
-        ground = track.window_poses(sleepers, anchor, pose.ahead, self.physics.window)
-        half_width = at_station(params.tunnel, sleepers.station[anchor] + pose.ahead)[4]
-        return Surroundings(ground, sleepers.quaternion[anchor], half_width, sleepers.position[anchor])
-
-    def position(self, state: WalkState, params: WalkParams) -> Float[Array, "3"]:
-        """Return the middle of the trunk in the tunnel frame, m."""
-        return params.track.position[state.anchor] + state.body.qpos[:3]
-
-    def _clearance(self, state: WalkState, station: Float[Array, ""], params: WalkParams) -> Float[Array, ""]:
-        """Distance from the nearer disc's middle to the nearest wall, m."""
-        middle = self.position(state, params)
-        ends = [middle + kinematics.rotate(state.body.qpos[3:7], jnp.array(bumper)) for bumper in BUMPERS]
-        return jnp.minimum(*[clearance(params.tunnel, end[:2], station) for end in ends])
-
     def _outside(self, station: Float[Array, ""], params: WalkParams) -> Bool[Array, ""]:
-        last = params.track.station.shape[0] - 1
-        return (station < params.track.station[0]) | (station > params.track.station[last])
+        return (station < params.track.station[0]) | (station > params.track.station[-1])
 
 
 def _push(body: Body, noise: WalkStepNoise, period: float, params: WalkParams) -> Body:

@@ -57,7 +57,6 @@ class FollowCamera:
         width: Width of a picture, pixels.
         height: Height of a picture, pixels.
         model: Model of a scene to draw instead.
-        leave_out: Surfaces of the bore that are not drawn.
         furnish: Adds to the model of a piece what its plan does not hold.
 
     Attributes:
@@ -71,11 +70,10 @@ class FollowCamera:
         width: int,
         height: int,
         model: "mujoco.MjModel | None" = None,
-        leave_out: tuple[str, ...] = (),
         furnish: "Callable[[mujoco.MjSpec, Piece], None] | None" = None,
     ):
         self._mujoco = import_mujoco("a picture by MuJoCo")
-        self._choice, self._size, self._leave_out, self._furnish = choice, (width, height), leave_out, furnish
+        self._choice, self._size, self._furnish = choice, (width, height), furnish
         self._renderer: mujoco.Renderer | None = None
         self._plans: dict[int, TunnelPlan] = {}
         self._piece: Piece | None = None
@@ -104,7 +102,7 @@ class FollowCamera:
             return plan
         piece = Piece.around(plan, self._choice.lining, station, facing)
         self._piece = dataclasses.replace(piece, texture=self._choice.texture)
-        spec = stage_spec(self._piece, leave_out=self._leave_out)
+        spec = stage_spec(self._piece)
         if self._furnish is not None:
             self._furnish(spec, self._piece)
         self._show(spec.compile())

@@ -49,11 +49,8 @@ class Piece:
         return bool(enough and (self.end >= self.plan.length or self.end - station >= after))
 
 
-def stage_spec(piece: Piece, *, leave_out: tuple[str, ...] = ()) -> mujoco.MjSpec:
+def stage_spec(piece: Piece) -> mujoco.MjSpec:
     """Return the model of a piece: its surfaces in the tunnel frame, lamps below the crown and fog.
-
-    Args:
-        leave_out: Names of surfaces to leave out.
 
     Raises:
         TunnelError: The plan does not have the lining.
@@ -70,9 +67,8 @@ def stage_spec(piece: Piece, *, leave_out: tuple[str, ...] = ()) -> mujoco.MjSpe
         pixels, of_wall = _wall_picture(piece, piece.plan.shell, piece.plan.texture)
     _add_picture(spec, "wall", pixels)
     for surface in tunnel_surfaces(piece.plan, piece.lining, piece.start, piece.end):
-        if surface.name not in leave_out:
-            walled = surface.name == "wall"
-            add_surface(spec, surface, *(("wall", of_wall) if walled else ()))
+        walled = surface.name == "wall"
+        add_surface(spec, surface, *(("wall", of_wall) if walled else ()))
     for k, place in enumerate(_lamps(piece)):
         spec.worldbody.add_light(
             name=f"lamp_{k}", pos=place, dir=(0.0, 0.0, -1.0), cutoff=180.0, exponent=0.0, castshadow=False,

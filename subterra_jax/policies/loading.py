@@ -99,10 +99,11 @@ def check_task(agent: Trained, env: TunnelEnv, params: EnvParams, source: str | 
 def training_conditions(env: Any, params: Any) -> Conditions:
     """Returns the conditions of an environment, as a policy that is trained in it carries them.
 
-    How far a hidden start is off is none of them: it changes what a robot is told, not what it senses or does.
+    How far a hidden start is off is none of them: it changes what a robot is told, not what it senses or does. A robot
+    by physics has no digest of constants: it may be asked how any policy does there.
     """
     given = params.replace(start=params.start.replace(station_sigma=0.0))
-    fields, constants = tuple(env.fields(params)), constants_digest(env, given)
+    fields, constants = tuple(env.fields(params)), constants_digest(env, given) if env.motion.on_the_plan else None
     return Conditions(env.id, _period(params), int(params.lidar.n_beams), fields, constants)
 
 
@@ -114,7 +115,8 @@ def _check_conditions(trained: Conditions, here: Conditions, source: str | Path)
         names, present = ", ".join(trained.fields or ()), ", ".join(here.fields or ())
         raise PolicyError(f"{source}: trained on the fields {names}; {here.task} has {present}")
     # Another task has other constants, and it may be asked how a policy does there.
-    if trained.task == here.task and trained.constants not in (None, here.constants):
+    known = None not in (trained.constants, here.constants)
+    if trained.task == here.task and known and trained.constants != here.constants:
         was, present = (trained.constants or "")[:12], (here.constants or "")[:12]
         raise PolicyError(f"{source}: trained under constants {was} of {here.task}, which has {present} here")
 

@@ -143,9 +143,7 @@ class _Legs:
         self.physics = None if walk is None else walk.physics
         self._poses: list[np.ndarray] = []
         if self.physics is not None:
-            from subterra_jax.b2.view import place  # MuJoCo is loaded only where a robot walks
-
-            self.physics.bench.watch = lambda data, origin: self._poses.append(place(data, origin))
+            self.physics.bench.watch = lambda data: self._poses.append(data.qpos[:N_POSE].copy())
 
     def standing(self, state: State, params: EnvParams) -> Float[np.ndarray, "1 m 19"]:
         """Return the pose before the first step, as often as a step has control periods."""

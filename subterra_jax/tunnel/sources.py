@@ -109,13 +109,14 @@ def resolve(
     """
     if isinstance(tunnel, Tunnel):
         return _single(tunnel, lining, piece, reach, spatial)
-    sources = _listed(tunnel)
+    sources = list_sources(tunnel)
     if not spatial and all(isinstance(each, str) and _is_ours(each) for each in sources):
         return jax.device_put(_named(tuple(sources), lining, piece, reach))
     return _joined(sources, lining, piece, reach, spatial)
 
 
-def _listed(tunnel: TunnelPlan | str | Path | Sequence[Source] | None) -> list[Source]:
+def list_sources(tunnel: TunnelPlan | str | Path | Sequence[Source] | None) -> list[Source]:
+    """Return each of what a user may name tunnels by; arguments as for `resolve`."""
     if tunnel is None:
         return [PACKAGED[0]]
     if isinstance(tunnel, str | Path):

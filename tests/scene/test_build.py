@@ -59,14 +59,26 @@ def test_whole_meshes_are_in_the_tunnel_frame(scene):
     assert trimesh.load(scene / "meshes" / "solid.ply").is_volume
 
 
-def test_the_scout_comes_to_rest_on_the_deck_inside_the_bore(scene):
+def test_the_rover_stands_then_drives_two_metres_and_turns(scene):
     model = mujoco.MjModel.from_xml_path(str(scene / "scene.xml"))
     data = mujoco.MjData(model)
-    start = data.qpos[:3].copy()
-    for _ in range(500):
-        mujoco.mj_step(model, data)
-    assert np.linalg.norm(data.qpos[:3] - start) < 0.05
+    assert (model.nu, model.actuator(0).name, model.actuator(1).name) == (2, "speed", "yaw_rate")
+    mujoco.mj_step(model, data, 250)
     assert np.abs(data.qvel).max() < 0.05
+    start, ahead = data.qpos[:3].copy(), data.body("scout").xmat.reshape(3, 3)[:, 0].copy()
+    data.ctrl[:] = (1.0, 0.0)
+    mujoco.mj_step(model, data, 560)
+    driven = data.qpos[:3] - start
+    assert driven @ ahead == pytest.approx(2.0, abs=0.15)
+    assert np.linalg.norm(driven - (driven @ ahead) * ahead) < 0.1
+    data.ctrl[:] = (0.0, 0.0)
+    mujoco.mj_step(model, data, 250)
+    driven = data.qpos[:3] - start
+    data.ctrl[:] = (0.0, 0.6)
+    mujoco.mj_step(model, data, 500)
+    now = data.body("scout").xmat.reshape(3, 3)[:, 0]
+    assert np.arctan2(np.cross(ahead, now)[2], ahead @ now) == pytest.approx(0.9, abs=0.15)  # it lags, and scrubs
+    assert np.linalg.norm(data.qpos[:3] - start - driven) < 0.1
 
 
 def test_the_middle_of_the_bore_is_free_and_its_walls_stop_a_body(scene):

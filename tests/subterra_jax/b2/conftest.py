@@ -5,11 +5,22 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import pytest
 
 import subterra_jax as st
+from subterra_jax.b2 import constants as b2
+from subterra_jax.b2.kinematics import standing_pose
 
 N_ROBOTS = 8
+
+
+def standing(model: mujoco.MjModel) -> mujoco.MjData:
+    """A B2 in the default pose on a floor at z = 0, with the targets that hold it."""
+    data = mujoco.MjData(model)
+    pose, data.ctrl[:] = standing_pose()
+    data.qpos[:] = [0.0, 0.0, b2.STAND_HEIGHT, 1.0, 0.0, 0.0, 0.0, *pose.tolist()]
+    return data
 
 
 @dataclasses.dataclass

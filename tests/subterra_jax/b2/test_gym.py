@@ -15,10 +15,11 @@ from gymnasium.error import ResetNeeded
 
 import subterra_jax as st
 from subterra_jax.adapters.kernel import pack
-from subterra_jax.b2 import mission, tasks
-from subterra_jax.b2.model import RobotError
+from subterra_jax.b2 import tasks
 from subterra_jax.b2.params import CommandParams
-from subterra_jax.b2.track import TrackError
+from subterra_jax.physics.ground import TrackError
+from subterra_jax.physics.rolling import RobotError
+from subterra_jax.physics.rotations import yaw
 from subterra_jax.policies import PolicyError
 from tests.subterra_jax.drawn import draw
 
@@ -120,7 +121,7 @@ def test_a_wall_stops_the_robot_and_ends_the_episode(env, plan):
     normal = np.array([-plan.tangent[at, 1], plan.tangent[at, 0]])
     qpos = np.array(state.legs.walk.body.qpos)
     qpos[:2] += (lateral - float(state.lateral)) * normal
-    turn = float(mission.yaw(state.legs.walk.body.qpos[3:7])) + 1.2
+    turn = float(yaw(state.legs.walk.body.qpos[3:7])) + 1.2
     qpos[3:7] = [np.cos(turn / 2), 0.0, 0.0, np.sin(turn / 2)]
     changed(env, legs=with_body(state, qpos), lateral=jnp.float32(lateral))
     _, _, terminated, _, info = env.step(np.array([0.8, 0.0], np.float32))
@@ -184,10 +185,9 @@ def test_who_asks_for_what_is_not_there_is_told_in_a_sentence(plan, tmp_path):
     narrow = dataclasses.replace(plan, half_width=np.full_like(plan.half_width, 0.3))
     with pytest.raises(RobotError, match=r"0\.60 m wide"):
         st.make(ID, narrow, policy="trot")
-    (tmp_path / "scene.xml").write_text("<mujoco><worldbody/></mujoco>")
     shutil.copy(Path(st.__file__).parent / "data" / "subterra-351.npz", tmp_path / "tunnel.npz")
-    with pytest.raises(TrackError, match="no track to walk on"):
-        st.make(ID, scene=tmp_path, policy="trot")
+    with pytest.raises(TrackError, match=r"scene\.xml is missing"):
+        st.make(ID, scene=tmp_path, policy="trot", engine="mujoco")
 
 
 DRAW = """

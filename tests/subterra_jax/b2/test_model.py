@@ -6,7 +6,9 @@ import pytest
 
 from subterra_jax.b2 import constants as b2
 from subterra_jax.b2.kinematics import standing_pose
-from subterra_jax.b2.model import add_stand, robot_spec
+from subterra_jax.b2.model import robot_spec
+from subterra_jax.host.rover import GROUND
+from tests.subterra_jax.b2.conftest import standing
 
 # Principal moments, from MuJoCo's own reading of the URDF (trunk) and from the mean leg, kg m².
 PRINCIPAL = {
@@ -25,8 +27,7 @@ def model():
 @pytest.fixture(scope="module")
 def on_floor():
     spec = robot_spec()
-    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0, 0, 1), contype=b2.GROUND, conaffinity=0)
-    add_stand(spec)
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0, 0, 1), contype=GROUND, conaffinity=0)
     return spec.compile()
 
 
@@ -71,8 +72,7 @@ def test_the_default_pose_puts_the_trunk_at_the_height_of_the_formula(model):
 
 
 def test_it_stands_for_ten_seconds_within_five_centimetres(on_floor):
-    data = mujoco.MjData(on_floor)
-    mujoco.mj_resetDataKeyframe(on_floor, data, 0)
+    data = standing(on_floor)
     moved = 0.0
     for _ in range(2500):
         mujoco.mj_step(on_floor, data)
@@ -85,15 +85,14 @@ def test_with_the_gains_of_the_isaac_configurations_it_collapses(on_floor):
     """Why the gains are ours: the figure that this rests on can be seen."""
     model = on_floor.__copy__()
     model.actuator_gainprm[:, 0], model.actuator_biasprm[:, 1], model.actuator_biasprm[:, 2] = 160.0, -160.0, -5.0
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, 0)
+    data = standing(model)
     data.ctrl[:] = standing_pose()[0]
     for _ in range(1000):
         mujoco.mj_step(model, data)
     assert data.qpos[2] < 0.4
 
 
-def test_only_feet_touch_the_ground_and_only_the_trunk_walls(model):
+def test_only_feet_touch_the_ground_and_only_the_bumpers_walls(model):
     touching = {model.geom(k).name: model.geom_conaffinity[k] for k in range(model.ngeom)}
-    assert touching == {"trunk": 8, **{f"{leg}_foot": 4 for leg in b2.LEGS}}
+    assert touching == {"trunk": 0, **dict.fromkeys(b2.BUMPERS, 8), **{f"{leg}_foot": 4 for leg in b2.LEGS}}
     assert (model.geom_contype == 0).all()

@@ -6,8 +6,10 @@ import pytest
 import trimesh
 
 from subterra_jax.b2 import constants as b2
-from subterra_jax.b2.model import add_stand, dress, robot_spec
+from subterra_jax.b2.model import dress, robot_spec
 from subterra_jax.b2.shape import shape_of
+from subterra_jax.host.rover import GROUND
+from tests.subterra_jax.b2.conftest import standing
 
 BODIES = ("base_link", *(f"{leg}_{part}" for leg in b2.LEGS for part in b2.PARTS))
 
@@ -31,18 +33,17 @@ def models():
     dress(dressed)
     for spec in (plain, dressed):
         ground = {"type": mujoco.mjtGeom.mjGEOM_PLANE, "size": (5.0, 5.0, 1.0)}
-        spec.worldbody.add_geom(name="ground", contype=b2.GROUND, conaffinity=0, **ground)
-        add_stand(spec)
+        spec.worldbody.add_geom(name="ground", contype=GROUND, conaffinity=0, **ground)
     return plain.compile(), dressed.compile()
 
 
 def test_the_robot_moves_by_the_same_bits_with_its_looks_as_without(models):
     ends = []
     for model in models:
-        data = mujoco.MjData(model)
-        mujoco.mj_resetDataKeyframe(model, data, 0)
+        data = standing(model)
+        hold = data.ctrl.copy()
         for step in range(300):
-            data.ctrl[:] = model.key_ctrl[0] + 0.3 * np.sin(0.05 * step + np.arange(12))
+            data.ctrl[:] = hold + 0.3 * np.sin(0.05 * step + np.arange(12))
             mujoco.mj_step(model, data)
         ends.append((data.qpos.tobytes(), data.qvel.tobytes(), data.qacc.tobytes()))
     assert ends[0] == ends[1]
@@ -64,8 +65,7 @@ def test_physics_has_no_looks_and_looks_touch_nothing(models):
 
 def test_it_stands_within_the_makers_envelope(models):
     model = models[1]
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, 0)
+    data = standing(model)
     mujoco.mj_kinematics(model, data)
     points = []
     for body in BODIES:

@@ -9,12 +9,10 @@ import pytest
 
 import subterra_jax as st
 from subterra_jax.b2 import constants as b2
-from subterra_jax.b2 import physics
-from subterra_jax.b2.kinematics import rotate
-from subterra_jax.b2.model import RobotError
 from subterra_jax.b2.observation import locate
-from subterra_jax.b2.params import Body, Surroundings
 from subterra_jax.b2.tasks import make
+from subterra_jax.physics.rolling import RobotError
+from subterra_jax.physics.rotations import rotate
 from tests.subterra_jax.b2.conftest import N_ROBOTS
 from tests.subterra_jax.tunnels import straight, tunnel_arrays
 
@@ -188,27 +186,6 @@ def test_a_wall_stops_a_robot_that_is_told_to_walk_through_it(walking):
     assert 2.45 < np.max(reached) < 2.825 - 0.1
 
 
-pushed = jax.jit(physics.wall_wrench)
-
-
-def wrench(lateral, speed=0.0, half_width=2.8):
-    """Of the walls on a robot that far to the left, moving there."""
-    qpos = jnp.zeros(19).at[1].set(lateral).at[2].set(0.5).at[3].set(1.0)
-    body = Body(qpos, jnp.zeros(18).at[1].set(speed), jnp.zeros(18))
-    around = Surroundings((jnp.zeros((7, 3)), jnp.zeros((7, 4))), jnp.array([1.0, 0, 0, 0]), jnp.float32(half_width))
-    return np.asarray(pushed(body, around))
-
-
-def test_walls_push_back_where_the_robot_is_in_them_and_nowhere_else():
-    np.testing.assert_array_equal(wrench(0.0), 0.0)
-    np.testing.assert_array_equal(wrench(2.5), 0.0)
-    np.testing.assert_allclose(wrench(2.6), [0.0, -2.0 * 2e4 * 0.025, 0.0, 0.0, 0.0, 0.0], rtol=1e-3, atol=1e-3)
-    assert wrench(-2.6)[1] > 0.0
-    assert wrench(2.6, speed=0.2)[1] < wrench(2.6)[1]
-    # Walls do not hold a robot that leaves them.
-    assert wrench(2.6, speed=-5.0)[1] == 0.0
-
-
 def test_a_tunnel_narrower_than_the_robot_is_refused_with_its_width(plan_of):
     narrow = plan_of(tunnel_arrays(straight(20.0), half_width=0.28))
     with pytest.raises(RobotError, match=r"is 0\.56 m wide at 0\.0 m; the B2 needs 0\.65 m"):
@@ -222,6 +199,6 @@ def test_a_misspelt_field_is_refused_by_name():
 
 def test_contacts_and_rows_stay_as_few_as_they_are_meant_to_be(walking):
     data = walking.env.physics.blank
-    assert data._impl.contact.dist.shape[0] == 8
-    assert data._impl.nefc == 12 + 4 * 8
+    assert data._impl.contact.dist.shape[0] == 4 * 2 + 2
+    assert data._impl.nefc == 12 + 4 * 8 + 2
     assert walking.env.physics.host.body("base_link").mass[0] == pytest.approx(b2.TRUNK.mass)

@@ -1,4 +1,4 @@
-"""A LiDAR that leans with the trunk: known answers in a straight corridor."""
+"""LiDARs that lean with the trunk: known answers in a straight corridor."""
 
 from types import SimpleNamespace
 
@@ -10,24 +10,39 @@ from flax.core import FrozenDict
 
 from subterra_jax import lidar
 from subterra_jax.b2 import constants as b2
-from subterra_jax.b2 import mission
-from subterra_jax.b2.track import lay_standard_track
 from subterra_jax.lidar import LidarParams
 from subterra_jax.lidar3d import Relief, beams
 from subterra_jax.lidar3d.space import Mount
 from subterra_jax.parts import Sight, make_sensor
+from subterra_jax.physics.ground import read_track
+from subterra_jax.physics.riding import Physical, SwayingLidar, SwayingSpatialLidar, yaw
 from subterra_jax.state import EnvParams
 from subterra_jax.tunnel import Tunnel
 from tests.subterra_jax.tunnels import straight, tunnel_arrays
 
 SENSOR = LidarParams(fused=False)
-ANCHOR, HEIGHT = 50, 0.5  # of the trunk's middle over the sleepers, m
+ANCHOR, HEIGHT = 50, 0.5  # of the trunk's middle over the floor, m
+MOTION = Physical(lidar_place=b2.LIDAR)
+
+
+def moment(params, quaternion, offset):
+    """What LiDARs are shown of a robot that far from its anchor."""
+    body = SimpleNamespace(qpos=jnp.concatenate([offset, quaternion, jnp.zeros(12)]))
+    ride, position = SimpleNamespace(body=body, anchor=jnp.int32(ANCHOR)), params.track.position[ANCHOR, :2]
+    station = params.track.station[ANCHOR]
+    return Sight(params.tunnel, position + offset[:2], yaw(quaternion), station, {MOTION.name: ride})
+
+
+def task(params, lidar, relief=None):
+    return EnvParams(
+        params.tunnel, jnp.int32(1), FrozenDict({"lidar": lidar, "track": params.track, "relief": relief}), "cover"
+    )
 
 
 @pytest.fixture(scope="module")
 def world(plan_of):
     plan = plan_of(tunnel_arrays(straight(80.0)))
-    return plan, SimpleNamespace(track=lay_standard_track(plan), tunnel=Tunnel.from_plan(plan, "smooth"))
+    return plan, SimpleNamespace(track=read_track(plan), tunnel=Tunnel.from_plan(plan, "smooth"))
 
 
 @pytest.fixture(scope="module")
@@ -36,9 +51,7 @@ def look(world):
 
     @jax.jit
     def ranges(quaternion, offset):
-        body = SimpleNamespace(qpos=jnp.concatenate([offset, quaternion, jnp.zeros(12)]))
-        walk = SimpleNamespace(body=body, anchor=jnp.int32(ANCHOR))
-        return mission.scan(walk, params.track.station[ANCHOR], params, SENSOR, None)
+        return SwayingLidar(motion=MOTION).true_ranges((), moment(params, quaternion, offset), task(params, SENSOR))
 
     return lambda quaternion, lateral=0.0: ranges(jnp.asarray(quaternion), jnp.array([0.0, lateral, HEIGHT]))
 
@@ -60,7 +73,7 @@ def test_level_it_sees_what_the_planar_lidar_sees_from_the_same_place(world, loo
 def test_nose_down_the_beam_ahead_ends_on_the_ballast(world, look):
     plan, params = world
     pitch = 0.1
-    height = HEIGHT + b2.LIDAR[2] * np.cos(pitch) - b2.LIDAR[0] * np.sin(pitch) + float(params.track.protrusion)
+    height = HEIGHT + b2.LIDAR[2] * np.cos(pitch) - b2.LIDAR[0] * np.sin(pitch) + float(params.track.protrusion[ANCHOR])
     ranges = look(leaning(pitch, "y"))
     assert float(ranges[0]) == pytest.approx(height / np.sin(pitch), rel=1e-4)
     half_width = float(np.interp(0.6 * ANCHOR, plan.station, plan.half_width))
@@ -87,17 +100,14 @@ def test_on_its_back_nothing_is_nan(look):
 def in_space(world):
     """Ranges of a LiDAR in three dimensions, and of the planar one, which sees the same surface from the same place."""
     plan, params = world
-    relief, part = Relief.from_plan(plan, "smooth"), mission.TrunkSpatialLidar()
+    relief = Relief.from_plan(plan, "smooth")
 
     @jax.jit
     def ranges(quaternion, mount):
-        body = SimpleNamespace(qpos=jnp.concatenate([jnp.array([0.0, 0.3, HEIGHT]), quaternion, jnp.zeros(12)]))
-        walk, station = SimpleNamespace(body=body, anchor=jnp.int32(ANCHOR)), params.track.station[ANCHOR]
-        sight = Sight(params.tunnel, jnp.zeros(2), jnp.zeros(()), station, {"legs": SimpleNamespace(walk=walk)})
-        parts = {"lidar": make_sensor(beams.planar(16), mount=mount), "walk": params, "relief": relief}
-        own = EnvParams(params.tunnel, jnp.int32(1), FrozenDict(parts), "cover")
-        met, _, _ = part.look((), sight, None, own)
-        return met.ranges, mission.scan(walk, station, params, SENSOR, relief)
+        sight = moment(params, quaternion, jnp.array([0.0, 0.3, HEIGHT]))
+        spatial = task(params, make_sensor(beams.planar(16), mount=mount), relief)
+        met, _, _ = SwayingSpatialLidar(motion=MOTION).look((), sight, None, spatial)
+        return met.ranges, SwayingLidar(motion=MOTION).true_ranges((), sight, task(params, SENSOR, relief))
 
     return lambda quaternion, **mount: jax.device_get(ranges(jnp.asarray(quaternion, jnp.float32), Mount(**mount)))
 

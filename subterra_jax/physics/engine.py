@@ -1,0 +1,304 @@
+"""One engine for robots that roll or walk: a control period in MJX on the window of ground, or in MuJoCo's own C."""
+
+import contextlib
+import dataclasses
+import io
+import threading
+from collections.abc import Callable
+from functools import cached_property
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from flax import struct
+from jax import lax
+from jaxtyping import Array, Float
+
+from subterra_jax.physics.ground import N_PLANES, Window, touched_planes
+from subterra_jax.physics.rotations import upright
+
+with contextlib.redirect_stdout(io.StringIO()):  # it prints that Warp, which is not used here, is missing
+    from mujoco import mjx
+
+TIMESTEP = 0.004  # of the physics, s
+PREFIX = "robot/"  # of the robot's names in a scene
+_ITERATIONS, _LINE_SEARCH = 10, 20  # of the solver in C: accuracy costs little on one robot
+
+
+@struct.dataclass
+class Body:
+    """State of the physics; positions from the anchor.
+
+    Attributes:
+        qpos: Trunk's position (m) and quaternion, joint angles (rad).
+        qvel: Trunk's velocity (m/s, world axes) and rates (rad/s, its own axes), joint speeds (rad/s).
+        warmstart: Accelerations of the last step, from which the solver starts.
+        act: States of actuators that lag behind their controls; none by default.
+    """
+
+    qpos: Float[Array, "n_qpos"]
+    qvel: Float[Array, "n_qvel"]
+    warmstart: Float[Array, "n_qvel"]
+    act: Float[Array, "n_act"] = dataclasses.field(default_factory=lambda: jnp.zeros(0))
+
+
+@struct.dataclass
+class Build:
+    """Properties of one robot, as drawn by domain randomisation.
+
+    Attributes:
+        friction: Friction of feet or wheels.
+        mass: Factor on every mass and inertia.
+        shift: Shift of the trunk's centre of mass, m.
+        stiffness: Factor on each servo's stiffness.
+        damping: Factor on each servo's damping.
+    """
+
+    friction: Float[Array, ""]
+    mass: Float[Array, ""]
+    shift: Float[Array, "3"]
+    stiffness: Float[Array, "n_servos"]
+    damping: Float[Array, "n_servos"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Machine:
+    """A robot for the engine. Its spec holds it alone, on a free joint.
+
+    Attributes:
+        spec: Makes its MJCF.
+        trunk: The body on the free joint.
+        treads: Balls that touch the ground.
+        bumpers: Balls on the trunk that touch walls.
+        half_width: Half the width of wheels in those balls, on whose z axes they turn, m; None without wheels.
+        dress: Adds looks for pictures; None where the spec has them.
+    """
+
+    spec: Callable[[], mujoco.MjSpec]
+    trunk: str
+    treads: tuple[str, ...]
+    bumpers: tuple[str, ...]
+    half_width: float | None = None
+    dress: Callable[[mujoco.MjSpec], None] | None = None
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Engine:
+    """A robot in MJX, thousands at once. It is compared by identity, so that bound methods can be jitted.
+
+    Attributes:
+        machine: The robot.
+        substeps: Steps of physics in a control period.
+        iterations: Iterations of the solver in each step.
+        ls_iterations: Iterations of its line search.
+    """
+
+    machine: Machine
+    substeps: int = 5
+    iterations: int = 1
+    ls_iterations: int = 5
+
+    @property
+    def period(self) -> float:
+        """Control period, s."""
+        return self.substeps * TIMESTEP
+
+    @cached_property
+    def alone(self) -> mujoco.MjModel:
+        """The robot without a ground."""
+        return self.machine.spec().compile()
+
+    @cached_property
+    def bumpers(self) -> Float[np.ndarray, "n 3"]:
+        """Places of the bumpers on the trunk, m."""
+        return self.alone.geom_pos[self._ids(self.alone, self.machine.bumpers)]
+
+    @cached_property
+    def reach(self) -> float:
+        """Radius of the bumpers, m: a nearer wall is touched."""
+        return float(self.alone.geom(self.machine.bumpers[0]).size[0])
+
+    @cached_property
+    def host(self) -> mujoco.MjModel:
+        """The robot with a plane for each contact that it may have."""
+        spec = self.machine.spec()
+        spec.option.iterations, spec.option.ls_iterations = self.iterations, self.ls_iterations
+        for name in (*self.machine.treads, *self.machine.bumpers):
+            geom = spec.geom(name)
+            for k in range(N_PLANES if name in self.machine.treads else 1):
+                plane = spec.worldbody.add_body(name=f"{name} {k}", mocap=True)
+                plane.add_geom(
+                    name=f"{name} {k}", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(1.0, 1.0, 1.0), contype=0, conaffinity=0
+                )
+                mu = geom.friction
+                spec.add_pair(
+                    geomname1=f"{name} {k}", geomname2=name, condim=geom.condim,
+                    friction=(mu[0], mu[0], mu[1], mu[2], mu[2]), solref=geom.solref, solimp=geom.solimp,
+                )  # fmt: skip
+        return spec.compile()
+
+    @cached_property
+    def model(self) -> mjx.Model:
+        """The same on the device."""
+        with jax.ensure_compile_time_eval():
+            return mjx.put_model(self.host, impl="jax")
+
+    @cached_property
+    def blank(self) -> mjx.Data:
+        """Empty data of the model."""
+        with jax.ensure_compile_time_eval():
+            return mjx.make_data(self.host, impl="jax")
+
+    @staticmethod
+    def _ids(model: mujoco.MjModel, names: tuple[str, ...], prefix: str = "") -> np.ndarray:
+        return np.array([model.geom(prefix + name).id for name in names])
+
+    def model_of(self, build: Build | None) -> mjx.Model:
+        """Return the model of one robot; of the robot as it is without a build."""
+        model = self.model
+        if build is None:
+            return model
+        trunk, pairs = self.host.body(self.machine.trunk).id, N_PLANES * len(self.machine.treads)
+        bias = model.actuator_biasprm.at[:, 1].multiply(build.stiffness).at[:, 2].multiply(build.damping)
+        return model.replace(
+            pair_friction=model.pair_friction.at[:pairs, :2].set(build.friction),
+            body_mass=model.body_mass * build.mass,
+            body_inertia=model.body_inertia * build.mass,
+            body_ipos=model.body_ipos.at[trunk].set(model.body_ipos[trunk] + build.shift),
+            actuator_gainprm=model.actuator_gainprm.at[:, 0].multiply(build.stiffness),
+            actuator_biasprm=bias,
+        )
+
+    def run(self, body: Body, control: Float[Array, "n_servos"], window: Window, build: Build | None = None) -> Body:
+        """Advance the robot by one control period.
+
+        Args:
+            body: State before the period.
+            control: Targets of the servos; they clip them to their ranges.
+            window: Ground and walls.
+            build: Properties of the robot; None for those of its model.
+        """
+        model, treads = self.model_of(build), self._ids(self.host, self.machine.treads)
+        data = self.blank.replace(ctrl=control)
+        wall_turns = jax.vmap(upright)(window.away)
+
+        def substep(now: Body, _: None) -> tuple[Body, None]:
+            here = data.replace(qpos=now.qpos, qvel=now.qvel, qacc_warmstart=now.warmstart, act=now.act)
+            placed = mjx.kinematics(model, here)
+            centre, axle = placed.geom_xpos[treads], placed.geom_xmat[treads][:, :, 2]
+            points, normals = jax.vmap(self._planes, (None, 0, 0))(window, centre, axle)
+            turns = jax.vmap(upright)(normals.reshape(-1, 3))
+            after = mjx.step(
+                model,
+                here.replace(
+                    mocap_pos=jnp.concatenate([points.reshape(-1, 3), window.wall]),
+                    mocap_quat=jnp.concatenate([turns, wall_turns]),
+                ),
+            )
+            return Body(after.qpos, after.qvel, after.qacc_warmstart, after.act), None
+
+        # A GPU would round the products inside MJX to TF32, three digits.
+        with jax.default_matmul_precision("highest"):
+            return lax.scan(substep, body, None, length=self.substeps)[0]
+
+    def _planes(self, window: Window, centre: Float[Array, "3"], axle: Float[Array, "3"]) -> tuple[Array, Array]:
+        tread = self.alone.geom(self.machine.treads[0])
+        return touched_planes(window, centre, axle, float(tread.size[0]), self.machine.half_width)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MujocoEngine(Engine):
+    """MuJoCo in C on the host, in a world with a ground of its own; it advances the robots of a batch in turn.
+
+    Attributes:
+        world: Makes the MJCF of the world in the tunnel frame.
+    """
+
+    world: Callable[[], mujoco.MjSpec] = mujoco.MjSpec
+
+    def placed(self) -> mujoco.MjSpec:
+        """Return the world with the robot in it."""
+        spec, robot = self.world(), self.machine.spec()
+        option, own = spec.option, robot.option
+        option.timestep, option.integrator, option.cone = own.timestep, own.integrator, own.cone
+        option.disableflags = own.disableflags
+        # MuJoCo warns where the two differ when they are joined.
+        option.iterations, option.ls_iterations = own.iterations, own.ls_iterations
+        spec.attach(robot, prefix=PREFIX, frame=spec.worldbody.add_frame())
+        option.iterations, option.ls_iterations = _ITERATIONS, _LINE_SEARCH
+        return spec
+
+    @cached_property
+    def bench(self) -> "Workbench":
+        return Workbench(self.placed().compile(), self.machine)
+
+    def run(self, body: Body, control: Float[Array, "n_servos"], window: Window, build: Build | None = None) -> Body:
+        """Advance the robot by one control period; see `Engine.run`. Of the window it takes the origin alone."""
+        shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, np.float32), body)
+        given = (body, control, window.origin, build)
+        return jax.pure_callback(self.run_rows, shapes, *given, vmap_method="broadcast_all")
+
+    def run_rows(self, body: Body, control: Any, origin: Any, build: Build | None) -> Body:
+        """Advance any number of robots by one control period; all arrays have the same leading axes."""
+        leaves, structure = jax.tree.flatten((body, control, origin, build))
+        batch = np.shape(body.qpos)[:-1]
+        n = int(np.prod(batch))
+        rows = [np.asarray(leaf).reshape(n, *np.shape(leaf)[len(batch) :]) for leaf in leaves]
+        each: Any = (jax.tree.unflatten(structure, [row[k] for row in rows]) for k in range(n))
+        after = [self.bench.run(one[0], one[1], one[2], one[3], self.substeps) for one in each]
+        stacked: Any = [
+            np.reshape(part, (*batch, *part[0].shape)) for part in zip(*map(jax.tree.leaves, after), strict=True)
+        ]
+        return Body(*stacked)
+
+
+class Workbench:
+    """One model with its data, used for many robots in turn; a step does not depend on the robot before.
+
+    Args:
+        model: A world with the robot and nothing else that moves.
+        machine: The robot.
+
+    Attributes:
+        model: The model.
+        data: Its data.
+        watch: Called with the data at the end of each control period, as for a film; `None` by default.
+    """
+
+    def __init__(self, model: mujoco.MjModel, machine: Machine):
+        self.model, self.data = model, mujoco.MjData(model)
+        self._lock = threading.Lock()  # held while a robot is advanced
+        self._treads = Engine._ids(model, machine.treads, PREFIX)
+        self._trunk = int(model.body(PREFIX + machine.trunk).id)
+        self._mass, self._inertia = model.body_mass.copy(), model.body_inertia.copy()
+        self._middle = model.body_ipos[self._trunk].copy()
+        self._gain, self._bias = model.actuator_gainprm.copy(), model.actuator_biasprm.copy()
+        self.watch: Callable[[mujoco.MjData], None] | None = None
+
+    def apply_build(self, build: Build) -> None:
+        model = self.model
+        model.geom_friction[self._treads, 0] = build.friction
+        model.body_mass[:] = self._mass * build.mass
+        model.body_inertia[:] = self._inertia * build.mass
+        model.body_ipos[self._trunk] = self._middle + build.shift
+        model.actuator_gainprm[:, 0] = self._gain[:, 0] * build.stiffness
+        model.actuator_biasprm[:, 1] = self._bias[:, 1] * build.stiffness
+        model.actuator_biasprm[:, 2] = self._bias[:, 2] * build.damping
+
+    def run(self, body: Body, control: np.ndarray, origin: np.ndarray, build: Build | None, n_steps: int) -> Body:
+        """Advance a robot by some steps of physics; its position is from `origin`, in the tunnel frame, m."""
+        data, anchor = self.data, np.asarray(origin, np.float64)
+        with self._lock:
+            if build is not None:
+                self.apply_build(build)
+            data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = body.qpos, body.qvel, body.warmstart
+            data.qpos[:3] += anchor
+            data.ctrl[:], data.act[:] = control, body.act
+            mujoco.mj_step(self.model, data, n_steps)
+            if self.watch is not None:
+                self.watch(data)
+            qpos = data.qpos.copy()
+            qpos[:3] -= anchor
+            return Body(*(part.astype(np.float32) for part in (qpos, data.qvel, data.qacc_warmstart, data.act)))

@@ -1,0 +1,183 @@
+"""The rover: it drives as told where the ground lets it, and nothing lets it through."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import subterra_jax as st
+from subterra_jax.host import rover
+from subterra_jax.physics.engine import Body, Engine, MujocoEngine
+from subterra_jax.physics.ground import RAIL_HALF, RAIL_OFFSET, join_tracks, read_track
+from subterra_jax.physics.riding import Ride, advance_period
+from subterra_jax.physics.rolling import ROVER, RobotError
+from subterra_jax.physics.stage import tunnel_world
+from subterra_jax.policies.opening import open_agent
+from subterra_jax.rules import StartParams
+from subterra_jax.tunnel import Tunnel
+from tests.subterra_jax.physics.test_ground import sleepers
+from tests.subterra_jax.tunnels import straight, tunnel_arrays
+
+ID = "Subterra/TraverseShort-v1"
+HALF_WIDTH = 2.0
+PERIOD = 0.02  # s
+
+
+@pytest.fixture(scope="module")
+def plans(plan_of):
+    """A level floor between two walls, and the same with sleepers that stand out by 6 cm, and rails."""
+    floor = plan_of(tunnel_arrays(straight(40.0), half_width=HALF_WIDTH))
+    return floor, dataclasses.replace(floor, shell=SimpleNamespace(track=sleepers(56, protrusion=0.06)))
+
+
+@pytest.fixture(scope="module", params=["mjx", "mujoco"])
+def drive(plans, request):
+    """Positions in the tunnel (m), heights over the floor (m) and velocities (m/s) of each control period, `(n, 3)`."""
+    tracks, tunnel = [read_track(plan) for plan in plans], Tunnel.from_plan(plans[0], "smooth")
+    both = join_tracks(tracks)
+    worlds = [lambda p=plan, t=track: tunnel_world(p, t, "smooth") for plan, track in zip(plans, tracks, strict=True)]
+    engines = [MujocoEngine(ROVER, world=world) for world in worlds]
+    in_mjx = Engine(ROVER)
+    quick = {"xla_backend_optimization_level": 0}
+    compiled = []
+
+    def advance(laid, ride, control):
+        if request.param == "mujoco":
+            origin, engine = np.asarray(both.position)[ride.anchor], engines[laid]
+            return Ride(engine.bench.run(ride.body, control, origin, None, engine.substeps), ride.anchor)
+        if not compiled:
+            one = lambda ride, control: advance_period(in_mjx, ride, control, None, both, tunnel)[0]  # noqa: E731
+            compiled.append(jax.jit(one).lower(ride, control).compile(quick))
+        return compiled[0](ride, control)
+
+    def run(laid, seconds, control, place=(10.0, 0.0, 0.0), yaw=0.0, velocity=(0.0, 0.0, 0.0)):
+        anchor = both.nearest(jnp.float32(place[0]), laid)
+        position = np.asarray(place) - np.asarray(both.position)[anchor]
+        position[2] += rover.HEIGHT
+        pose = np.array([*position, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2), *np.zeros(4)], np.float32)
+        rest = np.zeros(10, np.float32)
+        speed = rest.copy()
+        speed[:3] = velocity
+        ride, rows = Ride(Body(pose, speed, rest, np.zeros(2, np.float32)), anchor), []
+        for _ in range(round(seconds / PERIOD)):
+            ride = advance(laid, ride, np.array(control, np.float32))
+            rows.append((np.asarray(both.position)[ride.anchor] + ride.body.qpos[:3], ride.body.qvel[:3]))
+        where, velocity = (np.array(part) for part in zip(*rows, strict=True))
+        return where - [0.0, 0.0, rover.HEIGHT], velocity
+
+    return run
+
+
+def test_on_a_level_floor_it_goes_as_far_as_it_is_told(drive):
+    where, velocity = drive(0, 4.0, (1.0, 0.0))
+    assert where[-1, 0] - where[99, 0] == pytest.approx(2.0, rel=0.02)
+    assert np.abs(where[:, 1]).max() < 0.01
+    assert np.abs(where[50:, 2]).max() < 0.01, "its tyres give way by less than a centimetre"
+    assert velocity[-1, 0] == pytest.approx(1.0, rel=0.02)
+
+
+def test_it_turns_on_the_spot(drive):
+    where, _ = drive(0, 3.0, (0.0, 0.8))
+    assert np.linalg.norm(where[-1, :2] - where[0, :2]) < 0.05
+
+
+def test_a_wall_stops_it_within_a_centimetre(drive):
+    where, _ = drive(0, 3.0, (1.0, 0.0), (10.0, 0.8, 0.0), np.pi / 2)
+    nose = where[:, 1] + rover.HALF_SIZE[0]
+    assert HALF_WIDTH - 0.03 < nose.max() < HALF_WIDTH + 0.01
+    assert np.ptp(where[-25:], axis=0).max() < 0.01, "its wheels spin and it stays"
+
+
+def test_it_cannot_climb_a_rail(drive):
+    where, _ = drive(1, 3.0, (0.6, 0.0), yaw=0.6)
+    inner = RAIL_OFFSET - RAIL_HALF[0] - rover.TRACK / 2  # of its middle, where a wheel stood at the rail
+    assert 0.1 < where[:, 1].max() < inner + 0.01
+    assert where[:, 2].max() < 0.1
+
+
+def test_it_drives_over_sleepers_and_slips(drive):
+    where, _ = drive(1, 4.0, (0.8, 0.0))
+    assert 1.5 < where[-1, 0] - where[0, 0] < 3.1
+    assert -0.12 < where[:, 2].min() < where[:, 2].max() < 0.1
+
+
+def test_energy_does_not_come_from_nothing(drive):
+    """Dropped by 10 cm and pushed aside at 1 m/s, told to stand: it never has more energy than at first."""
+    where, velocity = drive(0, 2.0, (0.0, 0.0), (10.0, 0.0, 0.1), velocity=(0.0, 1.0, 0.0))
+    energy = 9.81 * where[:, 2] + 0.5 * np.sum(velocity**2, axis=1)  # J/kg
+    assert energy.max() < 9.81 * 0.1 + 0.5 + 1e-3
+    assert np.abs(velocity[-1]).max() < 0.02
+    assert where[-1, 2] == pytest.approx(0.0, abs=0.01)
+
+
+@pytest.fixture(scope="module")
+def task(plans):
+    env, params = st.make(ID, tunnel=plans[0], motion="rover", engine="mujoco")
+    reset, step = jax.jit(env.reset), jax.jit(env.step)
+
+    def go(commands, **changes):
+        other, obs = params.replace(**changes), []
+        first, state = reset(jax.random.key(1), other)
+        obs.append(first)
+        told = []
+        for k, command in enumerate(commands):
+            seen, state, *rest = step(jax.random.key(k), state, jnp.array(command, jnp.float32), other)
+            obs.append(seen)
+            told.append((state, *rest))
+        return np.array(obs), told
+
+    return env, params, go
+
+
+def test_its_task_is_that_of_the_kinematic_robot(task, plans):
+    env, params, go = task
+    wheels, planar = st.make(ID, tunnel=plans[0], vehicle=params.vehicle, start=params.start)
+    assert env.fields(params) == wheels.fields(planar)
+    assert env.rule == wheels.rule
+    open_agent(ID.split("/")[1], env, params.replace(start=StartParams(lateral=0.1)))  # one for wheels may drive it
+    obs, told = go([(1.0, 0.1)] * 40)
+    _, state = jax.jit(wheels.reset)(jax.random.key(1), planar)
+    np.testing.assert_allclose(state.position, told[0][0].position, atol=0.02)
+    far = []
+    for k in range(40):
+        _, state, *_ = jax.jit(wheels.step)(jax.random.key(k), state, jnp.array([1.0, 0.1]), planar)
+        far.append(float(state.station))
+    mine = [float(step[0].station) for step in told]
+    assert mine[-1] - mine[9] == pytest.approx(far[-1] - far[9], rel=0.02)
+    odometer = obs[:, env.fields(params)["distance"]] if "distance" in env.fields(params) else obs[:, 16:17]
+    assert float(odometer[-1, 0]) == pytest.approx(mine[-1] - 1.0, abs=0.4)
+    assert not any(bool(step[2]) for step in told)
+
+
+def test_a_wall_ends_its_episode_by_contact(task):
+    _, _, go = task
+    _, told = go([(1.0, 0.5)] * 60)
+    ends = [bool(step[2]) for step in told]
+    assert True in ends
+    info = told[ends.index(True)][4]
+    assert bool(info["contact"])
+    assert not bool(info["success"])
+    assert not bool(info["fall"])
+
+
+def test_what_it_cannot_do_is_refused_in_a_sentence(plans, plan_of):
+    floor, _ = plans
+    narrow = plan_of(tunnel_arrays(straight(40.0), half_width=0.4))
+    ask = lambda **options: st.make(ID, motion="rover", **options)  # noqa: E731
+    with pytest.raises(ValueError, match="TraverseShort-v1 has no motion 'hover'; it has wheels, rover"):
+        st.make(ID, motion="hover")
+    with pytest.raises(ValueError, match="B2Walk-v1 has no motion 'rover'; it has legs"):
+        st.make("Subterra/B2Walk-v1", motion="rover")
+    with pytest.raises(RobotError, match=r"is 0\.80 m wide at 0\.0 m; the rover needs 0\.90 m"):
+        ask(tunnel=narrow)
+    with pytest.raises(ValueError, match=r"start\.lateral = 1\.8 m may put the rover into a wall"):
+        ask(tunnel=floor, start=StartParams(lateral=1.8))
+    with pytest.raises(ValueError, match="a ready Tunnel holds no heights"):
+        ask(tunnel=Tunnel.from_plan(floor))
+    with pytest.raises(ValueError, match="no engine 'bullet'; there are mjx, mujoco"):
+        ask(tunnel=floor, engine="bullet")
+    with pytest.raises(ValueError, match="drives in one tunnel, got 2"):
+        ask(tunnel=[floor, floor], engine="mujoco")
