@@ -106,7 +106,7 @@ def in_space(world):
     def ranges(quaternion, mount):
         sight = moment(params, quaternion, jnp.array([0.0, 0.3, HEIGHT]))
         spatial = task(params, make_sensor(beams.planar(16), mount=mount), relief)
-        met, _, _ = SwayingSpatialLidar(motion=MOTION).look((), sight, None, spatial)
+        met, *_ = SwayingSpatialLidar(motion=MOTION).look((), sight, None, spatial)
         return met.ranges, SwayingLidar(motion=MOTION).true_ranges((), sight, task(params, SENSOR, relief))
 
     return lambda quaternion, **mount: jax.device_get(ranges(jnp.asarray(quaternion, jnp.float32), Mount(**mount)))
