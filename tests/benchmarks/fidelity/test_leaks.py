@@ -99,14 +99,3 @@ def test_the_builder_opens_only_its_own_recording(tmp_path: Path) -> None:
     }
     assert "groundtruth.tum" in inside
     assert not {"survey_vlp16.bag", "groundtruth_vlp16.tum", "truth.json", "truth.ply"} & inside
-
-
-def test_the_hook_sees_what_is_opened(tmp_path: Path) -> None:
-    file = tmp_path / "seen"
-    file.write_text("x")
-    with opened_files() as opened:
-        file.read_text()
-    assert file in opened
-    other = tmp_path / "later"
-    other.write_text("x")
-    assert other not in opened
