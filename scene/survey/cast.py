@@ -80,7 +80,7 @@ PULSE = 0.75  # m: echoes further apart in range are told apart by the receiver;
 ALBEDO = np.zeros(len(Part))
 ALBEDO[[Part.LINING, Part.JOINT, Part.POCKET, Part.NAIL]] = 0.30, 0.15, 0.24, 0.45
 ALBEDO[[Part.FLOOR, Part.SLEEPER, Part.RAIL, Part.FASTENING]] = 0.20, 0.36, 0.42, 0.28
-ALBEDO[[Part.THING, Part.TERRAIN, Part.DARK]] = 0.35, 0.25, 0.0  # grass and earth outside; black sheets on the lining
+ALBEDO[Part.THING] = 0.35
 
 
 class Face:
@@ -135,17 +135,6 @@ def noise_sigma(
     return np.sqrt(
         errors.range_noise**2 + (errors.range_noise_per_metre * reach) ** 2 + (errors.incidence_noise * tangent) ** 2
     )
-
-
-_STRAY = 6.0  # m, most that a stray return lies behind the surface met
-
-
-def draw_strays(rng: np.random.Generator, share: float, distance: Float32[np.ndarray, "n"]) -> Float32[np.ndarray, "n"]:
-    """Return distances, m, of which a share is longer by up to 6 m; nothing is drawn where the share is 0."""
-    if share <= 0.0:
-        return distance
-    stray = rng.random(len(distance), np.float32) < share
-    return distance + np.where(stray, _STRAY * rng.random(len(distance), np.float32), np.float32(0.0))
 
 
 def mix_pixels(
@@ -244,7 +233,6 @@ def sweeps(
         distance = hits.distance
         if errors.mixed_pixels > 0.0:
             distance = mix_pixels(rng, lidar, errors.mixed_pixels, caster, poses.position, heading, hits)
-        distance = draw_strays(rng, errors.strays, distance)
         sigma = noise_sigma(errors, distance, hits.cosine)
         # Rounded once, here: the cloud and the bag then hold the same point.
         seen = np.where(valid, distance + sigma * rng.standard_normal(len(ray), np.float32), 0.0).astype(np.float32)

@@ -11,10 +11,7 @@ from scene.survey.conventions import Convention
 from subterra_jax.host.texture import check_dial
 
 LidarName = Literal["avia", "vlp16", "os1"]
-TruthName = Literal[
-    "paper", "metro", "horseshoe", "irregular", "circle",
-    "portal", "corridor", "works", "platform", "road", "slabtrack",
-]  # fmt: skip
+TruthName = Literal["paper", "metro", "horseshoe", "irregular", "circle"]
 METRO_LENGTH = 351.0  # m of the real alignment that are at hand
 
 
@@ -34,8 +31,6 @@ class SensorErrors:
     distortion: bool = True
     imu_noise: bool = True  # White noise of accelerometer and gyroscope, and wander of the orientation.
     imu_bias: bool = True  # A constant bias and its random walk.
-    # Share of the returns that come from further away than the surface met, by up to 6 m.
-    strays: float = 0.0
     prism_noise: float = 0.0025  # Standard deviation of the total station in each axis, m.
 
 
@@ -47,8 +42,7 @@ class SurveyConfig:
     """
 
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]  # Folder to write to; made if missing.
-    # Kind of bore; from `portal` on places as scanners meet them.
-    truth: TruthName = "paper"
+    truth: TruthName = "paper"  # Kind of bore.
     length: float = 60.0  # Length of the bore along its centreline, m.
     seed: int = 0  # Draws all that is random; the same seed gives the same bytes.
     # Draw sizes (gauge, rings, pockets ...) within building tolerance.
@@ -103,7 +97,7 @@ def _check_errors(errors: SensorErrors) -> None:
         value = getattr(errors, name)
         if not 0.0 <= value < math.inf:
             raise ValueError(f"errors.{name} must not be negative, got {value:g}")
-    for name in ("mixed_pixels", "lost", "strays"):
+    for name in ("mixed_pixels", "lost"):
         value = getattr(errors, name)
         if not 0.0 <= value <= 1.0:
             raise ValueError(f"errors.{name} must lie between 0 and 1, got {value:g}")

@@ -89,7 +89,6 @@ class Furniture:
     sleepers: np.ndarray  # Stations of the sleepers' middles, m
     tracks: tuple[float, ...] = (0.0,)  # Middles of the tracks to the left of the axis, m; empty where there is none
     rise: float = SLEEPER_RISE  # Top of the sleepers above the floor, m
-    dark: tuple[float, float] = (0.0, 0.0)  # Stations between which the lining gives no echo, m
     sizes: Sizes = DESIGN  # Sizes as built
 
     @property

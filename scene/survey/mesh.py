@@ -25,8 +25,6 @@ class Part(IntEnum):
     RAIL = 6
     FASTENING = 7
     THING = 8
-    TERRAIN = 9
-    DARK = 10
 
 
 @dataclass(frozen=True)
@@ -207,7 +205,6 @@ def surface_mesh(alignment: Alignment, section: Section, furniture: Furniture) -
     part = np.full(quads.shape[:2], Part.LINING, np.uint8)
     middle = 0.5 * (rows[1:] + rows[:-1])
     part[np.min(abs(middle[:, None] - furniture.joints), axis=1, initial=np.inf) < _JOINT_HALF] = Part.JOINT
-    part[(middle > furniture.dark[0]) & (middle < furniture.dark[1])] = Part.DARK
     keep = np.ones(quads.shape[:2], bool)
     pockets, sizes = [], furniture.sizes
     for j, r, side in np.argwhere(furniture.pocketed[:, None, None] & ~furniture.filled):

@@ -159,22 +159,6 @@ def horseshoe() -> Shape:
     return _sample_half(Shape, np.concatenate([wall, _arc((0.0, 3.0), 2.9, 0.0, 0.5 * np.pi)]))
 
 
-def rectangle(width: float, height: float) -> Shape:
-    """Return a box section, m."""
-    wall = np.stack([np.full(2001, 0.5 * width), np.linspace(0.0, height, 2001)], axis=-1)
-    roof = np.stack([np.linspace(0.5 * width, 0.0, 2001), np.full(2001, height)], axis=-1)
-    return _sample_half(Shape, np.concatenate([wall, roof]))
-
-
-def vault(width: float, height: float, spring: float, foot: float = 0.0) -> Shape:
-    """Return an elliptic crown on walls that draw in by `foot` m towards the floor, m."""
-    rise = np.linspace(0.0, spring, 2001)
-    wall = np.stack([0.5 * width - foot * (1.0 - rise / spring) ** 2, rise], axis=-1)
-    turn = np.linspace(0.0, 0.5 * np.pi, 4001)
-    crown = np.stack([0.5 * width * np.cos(turn), spring + (height - spring) * np.sin(turn)], axis=-1)
-    return _sample_half(Shape, np.concatenate([wall, crown]))
-
-
 def circle() -> Shape:
     """Return a shield bore of 2.898 m radius, as the real metro's rings, its invert filled flat to a depth of 0.9 m."""
     radius, fill = 2.898, 0.9
@@ -212,12 +196,11 @@ class Section:
     height_field: Field  # Slow deviation from its height, m
     roughness: Field  # Deviation along the outward normal by station and girth, m
     widening: Trend = field(default_factory=Trend)  # Further width by station, m
-    aside: Trend = field(default_factory=Trend)  # Further width by station on the left of the axis alone, m
     # Rise of the floor towards the left, m/m; on the axis it lies half the height below the centreline
     crossfall: float = 0.0
 
     def width(self, station: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-        """Return the largest width between the smooth walls, `aside` left out, m."""
+        """Return the largest width between the smooth walls, m."""
         return self.shape.width + self.width_field.along(station) + self.widening(station)
 
     def height(self, station: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
@@ -233,8 +216,6 @@ class Section:
         height = self.height(station)
         nodes = self.shape.scaled(self.width(station), height)
         nodes[..., 1] -= 0.5 * height[:, None]
-        left = 1.0 + 2.0 * self.aside(station)[:, None] / self.width(station)[:, None]
-        nodes[..., 0] *= np.where(nodes[..., 0] > 0.0, left, 1.0)
         self._on_floor(nodes, height)
         return nodes
 

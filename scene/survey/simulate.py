@@ -126,7 +126,6 @@ def simulate(config: SurveyConfig, console: Console) -> str:
     """Writes the survey of `config`; returns a line that says what was written."""
     of_bore, of_walk, of_prism, _, of_sensors = np.random.SeedSequence(config.seed).spawn(5)
     bore = draw_bore(of_bore, config.length, config.truth, config.correlation, config.tolerances)
-    config = replace(config, errors=replace(config.errors, strays=max(config.errors.strays, bore.strays)))
     mesh = bore.mesh()
     walk = draw_walk(np.random.default_rng(of_walk), bore, config.speed, SCAN_PERIOD)
     config.out.mkdir(parents=True, exist_ok=True)
