@@ -27,7 +27,7 @@ from scene.fitting.trackseen import find_track, measure_gauge
 from scene.inputs import hash_inputs
 from scene.judging.judge import Judgement, JudgingConfig, Warned, judge_bore, require_trust
 from scene.judging.page import render_page
-from scene.judging.returns import track_zone
+from scene.judging.places import track_zone
 from scene.judging.sanity import doubt_bore, doubt_layers, doubt_track
 from scene.poses.calibration import UNCALIBRATED, Calibration, find_calibration
 from scene.poses.kept import find_kept, forget_kept, keep_placed, load_kept

@@ -15,12 +15,11 @@ from scipy.spatial import cKDTree
 
 from scene.cleaning import sort
 from scene.cleaning.follow import N_RAYS, Course, Seed, find_seeds, follow_bore, join_courses
-from scene.cleaning.planes import find_plane_walls
 from scene.cleaning.sort import Cleaned, look_around, part_of_cloud, sort_points
-from scene.cleaning.tube import Tube, measure_tube
+from scene.cleaning.tube import Tube, find_plane_walls, measure_tube
 from scene.cloud import Cloud, thin_and_count
 from scene.errors import Cause, FitError, Refusal
-from scene.fitting.centreline import CentrelineConfig, centre_axis, smooth_axis
+from scene.fitting.assemble import CentrelineConfig, centre_axis, smooth_axis
 from scene.geometry import Axis, bin_angles
 
 _COARSE = 0.15  # m, voxel of the cloud that is followed

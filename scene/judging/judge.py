@@ -10,8 +10,21 @@ from scene.bore import Bore
 from scene.cleaning.sort import Removed
 from scene.cloud import Cloud
 from scene.errors import OUTSIDE, Code, FitError
-from scene.judging.places import Coverage, Place, find_places, find_unseen, measure_overruns, name_span
-from scene.judging.returns import BEHIND, BEYOND, EXPLAINED, INSIDE, Returns, TrackZone, compare_returns
+from scene.judging.places import (
+    BEHIND,
+    BEYOND,
+    EXPLAINED,
+    INSIDE,
+    Coverage,
+    Place,
+    Returns,
+    TrackZone,
+    compare_returns,
+    find_places,
+    find_unseen,
+    measure_overruns,
+    name_span,
+)
 
 _FLAG = tyro.conf.arg(prefix_name=False)
 _LISTED = 10  # places and worst stations that are listed

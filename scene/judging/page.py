@@ -11,8 +11,7 @@ from jaxtyping import Float
 
 from scene.bore import Bore
 from scene.judging.judge import Judgement
-from scene.judging.places import name_span
-from scene.judging.returns import BEHIND, BEYOND, EXPLAINED, INSIDE, Returns
+from scene.judging.places import BEHIND, BEYOND, EXPLAINED, INSIDE, Returns, name_span
 
 COLOURS = {EXPLAINED: "#9aa5b1", INSIDE: "#d64545", BEHIND: "#2f6fde", BEYOND: "#c9a227"}
 _WALL = "#111827"

@@ -6,7 +6,7 @@ import pytest
 from scene.cleaning.sort import list_removed
 from scene.cleaning.tube import bridge_hanging
 from scene.errors import Cause
-from scene.fitting.centreline import section_middles
+from scene.fitting.assemble import section_middles
 from scene.fitting.section import visible_span
 from scene.geometry import axis_through
 from tests.scene.clouds import curved_d_bore

@@ -7,7 +7,7 @@ from scene.bore import Bore
 from scene.cloud import Cloud
 from scene.errors import Cause, Code, FitError
 from scene.judging.judge import Judgement, JudgingConfig, judge_bore, require_trust
-from scene.judging.returns import BEHIND, BEYOND, EXPLAINED, INSIDE, TrackZone, compare_returns, wall_radius
+from scene.judging.places import BEHIND, BEYOND, EXPLAINED, INSIDE, TrackZone, compare_returns, wall_radius
 
 FLOOR = -3.2
 
