@@ -15,9 +15,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from subterra_jax.compiled import in_32_bits
 from subterra_jax.host.errors import SubterraError
-from subterra_jax.lidar3d.cells import FACES, N_FACES
 from subterra_jax.lidar3d.finding import find, find_from
-from subterra_jax.lidar3d.relief import Relief
+from subterra_jax.lidar3d.relief import Relief, block_contents
 
 
 @in_32_bits()
@@ -180,7 +179,7 @@ def require_pattern(directions: Any, axes: tuple[int, ...] = (2, 3)) -> None:
 
 @in_32_bits()
 def require_free(relief: Relief, position: Any, station: float) -> None:
-    """Check that a sensor stands free in a bore: where no triangle reaches, and in no box.
+    """Check that a sensor stands free in a bore: that it is seen from the axis within 2 m of its station.
 
     Args:
         relief: Surface of one bore.
@@ -188,20 +187,52 @@ def require_free(relief: Relief, position: Any, station: float) -> None:
         station: Station of the sensor, m.
 
     Raises:
-        SubterraError: It is inside the wall or a thing, or among the wall's bumps.
+        SubterraError: It is inside the wall or a thing.
     """
-    place, first = np.asarray(position, np.float64), int(relief.first_block)
-    rows = np.asarray(relief.frame[first : first + int(relief.n_blocks)], np.float64)
+    place = np.asarray(position, np.float64)
+    first, n = int(relief.first_block), int(relief.n_blocks)
+    rows = np.asarray(relief.frame[first : first + n], np.float64)
     nearest = int(np.argmin(np.linalg.norm(rows[:, :3] - place, axis=1)))
-    row, (*_, first_box, n_boxes) = rows[nearest], np.asarray(relief.link[first + nearest]).tolist()
-    at = row[3:12].reshape(3, 3) @ (place - row[:3])
-    box = np.asarray(relief.box[first_box : first_box + n_boxes], np.float64).reshape(-1, 3, 4)
-    within = (np.abs(box[..., :3] @ at - box[..., 3]) <= 1.0).all(axis=1)
-    if np.any(FACES @ at[1:] > row[-N_FACES:]) or within.any():
+    sensor = rows[nearest, 3:12].reshape(3, 3) @ (place - rows[nearest, :3])
+    on_axis = np.linspace(-2.0, 2.0, 9)[:, None] * [1.0, 0.0, 0.0]
+    surface, boxes = block_contents(relief, first + nearest)
+    hidden = _crosses_triangles(on_axis, sensor, surface) | _crosses_boxes(on_axis, sensor, boxes)
+    if hidden.all():
         x, y, z = place
         raise SubterraError(
-            f"the sensor at ({x:.2f}, {y:.2f}, {z:.2f}) m, station {station:.1f} m, is inside the wall, or in a thing"
+            f"the sensor at ({x:.2f}, {y:.2f}, {z:.2f}) m, station {station:.1f} m, is inside the wall, or in a thing: "
+            "it is not seen from the axis"
         )
+
+
+def _crosses_triangles(
+    start: Float[np.ndarray, "n 3"], end: Float[np.ndarray, "3"], corner: Float[np.ndarray, "t 3 3"]
+) -> Bool[np.ndarray, "n"]:
+    """Tell which lines between some points and another one cross a triangle; all in one frame, m."""
+    edges = np.roll(corner, -1, axis=1) - corner
+    normal = np.cross(edges[:, 0], edges[:, 1])
+    above_end = np.sum((end - corner[:, 0]) * normal, axis=1)
+    crosses = np.zeros(len(start), bool)
+    for k, point in enumerate(start):
+        above = np.sum((point - corner[:, 0]) * normal, axis=1)
+        cut = np.flatnonzero((above > 0.0) != (above_end > 0.0))
+        share = above[cut] / (above[cut] - above_end[cut])
+        met = point + share[:, None] * (end - point)
+        side = np.sum(np.cross(edges[cut], met[:, None] - corner[cut]) * normal[cut, None], axis=-1)
+        crosses[k] = (side >= 0.0).all(axis=1).any()
+    return crosses
+
+
+def _crosses_boxes(
+    start: Float[np.ndarray, "n 3"], end: Float[np.ndarray, "3"], box: Float[np.ndarray, "k 3 4"]
+) -> Bool[np.ndarray, "n"]:
+    """Tell which lines between some points and another one cross a box; boxes as in `Cells.box`."""
+    first, last = (np.einsum("kij,...j->...ki", box[..., :3], point) - box[..., 3] for point in (start, end))
+    step = last - first
+    step = np.where(np.abs(step) < 1e-12, 1e-12, step)
+    faces = np.stack([(-1.0 - first) / step, (1.0 - first) / step])
+    enters, leaves = faces.min(axis=0).max(axis=-1), faces.max(axis=0).min(axis=-1)
+    return ((enters <= leaves) & (enters <= 1.0) & (leaves >= 0.0)).any(axis=1)
 
 
 @in_32_bits()

@@ -9,7 +9,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from subterra_jax.lidar3d.cells import N_FACES, Cells, sort_triangles
+from subterra_jax.lidar3d.cells import N_FACES, N_WEDGES, STEP_BITS, X_BITS, Cells, sort_triangles
 from subterra_jax.lidar3d.rolled import raise_shell
 from subterra_jax.lidar3d.surface import Axis, Triangles
 from subterra_jax.lidar3d.upright import CROWN, raise_walls
@@ -163,6 +163,23 @@ def stack_reliefs(reliefs: Sequence[Relief]) -> Relief:
         n_x=reliefs[0].n_x,
         **{name: _put(np.concatenate(arrays), arrays[0].dtype) for name, arrays in parts.items()},
     )
+
+
+def block_contents(relief: Relief, block: int) -> tuple[Float[np.ndarray, "t 3 3"], Float[np.ndarray, "k 3 4"]]:
+    """Return the corners of a block's triangles in its frame, m, and its boxes as in `Cells.box`; on the host."""
+    *_, first_vertex, first_cell, first_box, n_boxes = np.asarray(relief.link[block]).tolist()
+    cell = np.asarray(relief.cell[first_cell : first_cell + relief.n_x * N_WEDGES]).view(np.uint32)
+    first_entry, n_entries = int(cell[0, 0]), int((cell[:, 1] >> 16).sum())
+    code = np.unique(np.asarray(relief.entry[first_entry : first_entry + n_entries]).view(np.uint32)).astype(np.int64)
+    first, most = code >> 2 * STEP_BITS, (1 << STEP_BITS) - 1
+    steps = np.stack([np.zeros_like(code), code >> STEP_BITS & most, code & most], axis=-1)
+    number = first_vertex + first[:, None] + steps
+    half, word = X_BITS // 2, np.asarray(relief.vertex[number.min(initial=0) : number.max(initial=0) + 1])
+    low = word & ((1 << half) - 1)
+    along = (low[:, 0] << half | low[:, 1]) - (1 << X_BITS - 1)
+    place = np.column_stack([along, word >> half]) / np.asarray(relief.frame[block], np.float64)[[22, 23, 23]]
+    box = np.asarray(relief.box[first_box : first_box + n_boxes], np.float64).reshape(-1, 3, 4)
+    return place[number - number.min(initial=0)], box
 
 
 def _put(values: Any, dtype: Any) -> Array:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import subterra_jax as st
 from subterra_jax import lidar3d, native
 from subterra_jax.lidar import nvidia
 from subterra_jax.lidar3d import beams, casting, finding, fused
@@ -282,3 +283,14 @@ def test_an_image_of_beams_has_the_ranges_and_derivatives_of_its_beams(reliefs):
     slopes = [jax.jacfwd(ranges)(place, pattern).reshape(64, 3) for pattern in (beam, beam.reshape(4, 16, 3))]
     assert np.abs(slopes[0]).max() > 0.5
     np.testing.assert_allclose(*slopes, atol=1e-6)
+
+
+def test_a_sensor_in_a_recess_is_free_and_one_in_the_wall_beside_it_is_not(bend, reliefs):
+    axis, row = bend[0], 82  # of 181 stations: the middle of a recess 0.3 m deep, at half a turn
+    tangent, turn = axis["tangent"][row], 20.5 * 2.0 * np.pi / 40
+    left = np.cross([0.0, 0.0, 1.0], tangent)
+    left /= np.linalg.norm(left)
+    at = lambda angle: axis["position"][row] + 2.12 * (np.cos(angle) * left + np.sin(angle) * np.cross(tangent, left))  # noqa: E731
+    lidar3d.require_free(reliefs["bend"], at(turn), axis["station"][row])
+    with pytest.raises(st.SubterraError, match=r"the sensor at .* is inside the wall, or in a thing"):
+        lidar3d.require_free(reliefs["bend"], at(turn + 0.6), axis["station"][row])
