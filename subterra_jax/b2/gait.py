@@ -74,7 +74,6 @@ def advance(
         command: Forward and to the left (m/s), yaw rate (rad/s).
         drift: Estimated velocity of the trunk minus the slewed command, in the same order and units.
         period: Control period, s.
-        params: The trot.
     """
     most = jnp.asarray(params.slew) * period
     velocity = state.velocity + jnp.clip(command - state.velocity, -most, most)
@@ -114,7 +113,6 @@ def targets(state: GaitState, gravity: Float[Array, "3"], params: GaitParams) ->
     Args:
         state: State of the gait.
         gravity: Direction of gravity in the trunk's axes, unit vector.
-        params: The trot.
 
     Returns:
         Joint targets, rad: the angles of the gait, plus the deflection of a servo of finite stiffness under the load.

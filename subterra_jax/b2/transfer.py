@@ -91,7 +91,6 @@ def stand_in(env: TunnelEnv, lag: Lag = Lag(), nod: Nod = Nod()) -> TunnelEnv:
     """Make the planar stand-in of the walking robot: the same task on wheels that lag, with a LiDAR that nods.
 
     Args:
-        env: A planar task.
         lag: Lags of the robot.
         nod: Lean of its trunk.
     """
@@ -122,8 +121,6 @@ def walk_robots(
     """Let robots walk until all have arrived or failed.
 
     Args:
-        env: The task.
-        params: Its params.
         agent: The agent that steers.
         n_robots: Number of robots.
         seed: Seed of the first; the others have those after it.

@@ -47,7 +47,6 @@ def localisability(env: Env, params: EnvParams, step: float = 1.0, index: int = 
     """Compute the bound in the middle of a tunnel, facing along the axis.
 
     Args:
-        env: A task.
         params: Its params: tunnel, LiDAR, texture of the walls.
         step: Distance between stations, m.
         index: Number of the tunnel in a stack.

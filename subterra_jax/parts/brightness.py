@@ -26,7 +26,6 @@ def wall_brightness(
     """Return factors on the reflectivity of the lining where beams end, and the tangent of the axis there.
 
     Args:
-        tunnel: The tunnel.
         station: Station of the sensor, m.
         position: Its position in plan, tunnel frame, m.
         ends: Ends of the beams, tunnel frame, m; in plan those of a planar LiDAR.
@@ -57,7 +56,6 @@ def intensity(
     Args:
         cosine: Cosine of incidence, 0 to 1.
         reflectivity: Reflectivity of what is met.
-        normal: Standard normal numbers.
         full: Reported for 100 % diffuse.
     """
     value: Any = full * reflectivity * cosine * (1.0 + SCALE_SIGMA * normal)

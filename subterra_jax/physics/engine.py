@@ -259,7 +259,6 @@ class Workbench:
 
     Args:
         model: A world with the robot and nothing else that moves.
-        machine: The robot.
 
     Attributes:
         model: The model.

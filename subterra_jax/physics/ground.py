@@ -37,27 +37,16 @@ class TrackError(SubterraError):
 
 @struct.dataclass
 class Track:
-    """Ground of a tunnel in order of station, or of several whose rows follow one another.
+    """Ground of a tunnel in order of station, or of several whose rows follow one another."""
 
-    Attributes:
-        station: Station of each row, m.
-        position: Middle of each sleeper's top, or of the floor, tunnel frame, m.
-        quaternion: Rotation of each: x along the track, y to the left, z up, with cant and grade.
-        protrusion: Height of its sleepers above the ballast, m; 0 on a floor without sleepers.
-        rails: 1 where there are rails, else 0.
-        first: First row of its tunnel.
-        last: Last row of its tunnel.
-        tunnel: Number of its tunnel in the stack.
-    """
-
-    station: Float[Array, "rows"]
-    position: Float[Array, "rows 3"]
-    quaternion: Float[Array, "rows 4"]
-    protrusion: Float[Array, "rows"]
-    rails: Float[Array, "rows"]
-    first: Int[Array, "rows"]
-    last: Int[Array, "rows"]
-    tunnel: Int[Array, "rows"]
+    station: Float[Array, "rows"]  # station of each row, m
+    position: Float[Array, "rows 3"]  # middle of each sleeper's top, or of the floor, tunnel frame, m
+    quaternion: Float[Array, "rows 4"]  # rotation of each: x along the track, y to the left, z up, with cant and grade
+    protrusion: Float[Array, "rows"]  # height of its sleepers above the ballast, m; 0 on a floor without sleepers
+    rails: Float[Array, "rows"]  # 1 where there are rails, else 0
+    first: Int[Array, "rows"]  # first row of its tunnel
+    last: Int[Array, "rows"]  # last row of its tunnel
+    tunnel: Int[Array, "rows"]  # number of its tunnel in the stack
 
     def nearest(self, station: Float[Array, ""], tunnel: Int[Array, ""] | int = 0) -> Int[Array, ""]:
         """Return the row of a tunnel nearest to a station."""
@@ -151,27 +140,16 @@ def _protrusion(tops: Float[np.ndarray, "k 3"], bricks: np.ndarray) -> float:
 
 @struct.dataclass
 class Window:
-    """What a robot may touch in one control period; positions from the anchor.
+    """What a robot may touch in one control period; positions from the anchor."""
 
-    Attributes:
-        origin: Position of the anchor, tunnel frame, m.
-        position: Middles of the nearest rows of the track, m.
-        axes: Axes of each: ahead, left, up.
-        protrusion: As for `Track`.
-        rails: As for `Track`.
-        wall: Nearest point of a wall to each bumper, m.
-        away: Level unit vector from that point to the bumper.
-        gap: Distance between them, m; exact below 0.8 m.
-    """
-
-    origin: Float[Array, "3"]
-    position: Float[Array, "4 3"]
-    axes: Float[Array, "4 3 3"]
-    protrusion: Float[Array, ""]
-    rails: Float[Array, ""]
-    wall: Float[Array, "n 3"]
-    away: Float[Array, "n 3"]
-    gap: Float[Array, "n"]
+    origin: Float[Array, "3"]  # position of the anchor, tunnel frame, m
+    position: Float[Array, "4 3"]  # middles of the nearest rows of the track, m
+    axes: Float[Array, "4 3 3"]  # axes of each: ahead, left, up
+    protrusion: Float[Array, ""]  # as for `Track`
+    rails: Float[Array, ""]  # as for `Track`
+    wall: Float[Array, "n 3"]  # nearest point of a wall to each bumper, m
+    away: Float[Array, "n 3"]  # level unit vector from that point to the bumper
+    gap: Float[Array, "n"]  # distance between them, m; exact below 0.8 m
 
 
 def look_around(
@@ -184,8 +162,6 @@ def look_around(
     """Return the window about a robot, and its station, m.
 
     Args:
-        track: The ground.
-        tunnel: The tunnel.
         anchor: Row nearest to the robot.
         qpos: Position of its trunk from there, m, its rotation, and whatever follows.
         bumpers: Places on the trunk that are kept out of walls, m.
@@ -282,7 +258,6 @@ def move_anchor(
     """Move the anchor by at most one row after the robot.
 
     Args:
-        track: The ground.
         anchor: The anchor so far.
         position: Position of the robot from that anchor, m.
 

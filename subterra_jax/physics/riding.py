@@ -41,7 +41,6 @@ def place_on(track: Track, plane: State, height: float) -> tuple[Float[Array, "7
     """Return position from the anchor (m) and rotation of a trunk over the ground, and the anchor.
 
     Args:
-        track: The ground.
         plane: Station, lateral offset, heading and number of the tunnel.
         height: Height of the trunk's middle over the sleepers' tops, m.
     """
@@ -149,7 +148,6 @@ def lidar_pose(
     Args:
         ride: The robot, which gives height and lean.
         sight: The moment, which gives position and heading; faults show an earlier one.
-        track: The ground.
         place: Where the LiDAR stands on the trunk, m.
         lateral: Distance to the left of there, m.
     """
@@ -223,11 +221,8 @@ def scan(
 
     Args:
         origin: Place of the LiDAR, tunnel frame, m.
-        turn: Its rotation.
         anchor: Row of the track nearest to it.
         sight: The moment that is shown.
-        track: The ground.
-        sensor: The LiDAR.
         relief: The bore's surface, if there is one.
 
     Returns:
