@@ -20,7 +20,6 @@ from PIL import Image
 from benchmarks.draw.scene import picture
 from benchmarks.results import png_bytes
 from benchmarks.truth import Truth, centreline, scene_points
-from subterra_jax.host.tunnelfile import read_fields
 from subterra_jax.pictures.renderer import PictureError
 
 _STYLE = """
@@ -131,22 +130,6 @@ def section_overlays(bore_path: Path, points: Float[np.ndarray, "p 3"], count: i
     return figure
 
 
-def plan_of_walls(tunnel_path: Path, lining: str = "pockets", stretch: float = 20.0) -> Figure:
-    """Draws the first metres of the planar tunnel from above, as the environment's LiDAR sees them."""
-    tunnel = read_fields(tunnel_path)
-    figure, axes = plt.subplots(figsize=(11, 3), layout="constrained")
-    origin, heading = tunnel["centre"][0], tunnel["tangent"][0]
-    turn = np.array([heading, [-heading[1], heading[0]]])
-    for side in ("left", "right"):
-        wall = tunnel[f"{side}_{lining}"][tunnel[f"{side}_station_{lining}"] < stretch]
-        axes.plot(*(turn @ (wall - origin).T), color=_INK, lw=1.0)
-    axes.plot(*(turn @ (tunnel["centre"][tunnel["station"] < stretch] - origin).T), color=_TRUTH, lw=0.8, ls=":")
-    axes.set(xlabel="m", ylabel="m", aspect="equal")
-    axes.set_title(f"Walls at LiDAR height, {float(tunnel['lidar_height']):g} m above the sleepers ({lining})")
-    axes.grid(alpha=0.3)
-    return figure
-
-
 class Row(NamedTuple):
     """A row of the report: key in `summary.json`, text, unit with its factor, decimals, goal and its direction."""
 
@@ -190,7 +173,6 @@ def write_report(out: Path, summary: dict[str, Any], truth: Truth) -> Path:
         "modelled kinematically. Sensor: 16 planar ranges and a drifting odometer. Reward: the paper's, for the share "
         "of the tunnel newly covered, less offset from the middle and changes of command."
     )
-    seen = "The first 20 m as the environment's LiDAR sees them: walls and bolt pockets at its height."
     learnt = "Coverage of each training episode and their mean of 100."
     seconds = [((name, f"{value:.1f}"), False) for name, value in summary["stage_seconds"].items()]
     parts = [
@@ -202,8 +184,7 @@ def write_report(out: Path, summary: dict[str, Any], truth: Truth) -> Path:
         html_text(_verdict(out / "scene")),
         html_text("The bore", "h2"),
         *_bore_parts(out, truth),
-        html_text("The environment and what was learnt in it", "h2"),
-        html_figure(plan_of_walls(out / "scene" / "tunnel.npz"), seen),
+        html_text("What was learnt in it", "h2"),
         html_figure((out / "training" / "curve.png").read_bytes(), learnt),
         html_text("Where the time went", "h2"),
         html_table(("Stage", "Seconds"), seconds),
