@@ -53,6 +53,8 @@ def rover_spec() -> mujoco.MjSpec:
     return spec
 
 
+# At 1.5 m/s over sleepers one iteration, enough for feet, overturns it.
+SOLVER = {"iterations": 3, "ls_iterations": 8}
 ROVER = Machine(rover_spec, rover.NAME, rover.WHEELS, rover.BUMPERS, rover.WHEEL_HALF)
 
 
@@ -67,7 +69,7 @@ class Rover(Physical):
         periods: Control periods of the engine in one of the task.
     """
 
-    engine: Engine = dataclasses.field(default_factory=lambda: Engine(ROVER))
+    engine: Engine = dataclasses.field(default_factory=lambda: Engine(ROVER, **SOLVER))
     periods: int = 5
     lidar_place: tuple[float, float, float] = (0.0, 0.0, rover.LIDAR_HEIGHT - rover.HEIGHT)
     name: ClassVar[str] = "rover"

@@ -10,10 +10,10 @@ import pytest
 
 import subterra_jax as st
 from subterra_jax.host import rover
-from subterra_jax.physics.engine import Body, Engine, MujocoEngine
+from subterra_jax.physics.engine import Body, MujocoEngine
 from subterra_jax.physics.ground import RAIL_HALF, RAIL_OFFSET, join_tracks, read_track
 from subterra_jax.physics.riding import Ride, advance_period
-from subterra_jax.physics.rolling import ROVER, RobotError
+from subterra_jax.physics.rolling import ROVER, RobotError, Rover
 from subterra_jax.physics.stage import tunnel_world
 from subterra_jax.policies.opening import open_agent
 from subterra_jax.rules import StartParams
@@ -40,7 +40,7 @@ def drive(plans, request):
     both = join_tracks(tracks)
     worlds = [lambda p=plan, t=track: tunnel_world(p, t, "smooth") for plan, track in zip(plans, tracks, strict=True)]
     engines = [MujocoEngine(ROVER, world=world) for world in worlds]
-    in_mjx = Engine(ROVER)
+    in_mjx = Rover().engine
     quick = {"xla_backend_optimization_level": 0}
     compiled = []
 
@@ -102,6 +102,9 @@ def test_it_drives_over_sleepers_and_slips(drive):
     where, _ = drive(1, 4.0, (0.8, 0.0))
     assert 1.5 < where[-1, 0] - where[0, 0] < 3.1
     assert -0.12 < where[:, 2].min() < where[:, 2].max() < 0.1
+    fast, _ = drive(1, 8.0, (1.2, 0.0), (10.0, 0.1, 0.0))
+    assert 7.0 < fast[-1, 0] - fast[0, 0] < 9.6
+    assert fast[:, 2].max() < 0.1, "it overturned"
 
 
 def test_energy_does_not_come_from_nothing(drive):
