@@ -50,7 +50,7 @@ def _run(module: str, *words: object) -> None:
 
 
 def step_in_mujoco_and_mjx(scene: Path) -> dict[str, Any]:
-    """Steps a scene once in MuJoCo and MJX; returns versions, sizes and MJX's compile time."""
+    """Drives the rover of a scene for 4 s in MuJoCo and steps it in MJX; returns versions, sizes and distance, m."""
     import jax
     import numpy as np
 
@@ -59,7 +59,10 @@ def step_in_mujoco_and_mjx(scene: Path) -> dict[str, Any]:
         from mujoco import mjx
 
     model = mujoco.MjModel.from_xml_path(str(scene / "scene.xml"))
-    mujoco.mj_step(model, mujoco.MjData(model))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    start, data.ctrl[:] = data.body("scout").xpos.copy(), (0.8, 0.0)
+    mujoco.mj_step(model, data, round(4.0 / model.opt.timestep))
     started = time.monotonic()
     stepped = jax.jit(mjx.step)(mjx.put_model(model), mjx.make_data(model))
     finite = bool(np.isfinite(np.asarray(stepped.qpos)).all())
@@ -67,6 +70,7 @@ def step_in_mujoco_and_mjx(scene: Path) -> dict[str, Any]:
         "mujoco_version": mujoco.__version__,
         "geoms": int(model.ngeom),
         "mesh_faces": int(model.nmeshface),
+        "rover_metres": float(np.linalg.norm(data.body("scout").xpos - start)),
         "mjx_compile_seconds": time.monotonic() - started,
         "mjx_state_finite": finite,
     }

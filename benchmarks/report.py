@@ -156,6 +156,7 @@ _ROWS = (
     Row("train_steps", "Environment steps of training", "million", 1e-6),
     Row("geoms", "Geoms in the scene", "", decimals=0),
     Row("mesh_faces", "Triangles in the scene", "", decimals=0),
+    Row("rover_metres", "Driven by its rover in 4 s", "m"),
     Row("seconds", "The whole demo", "s", decimals=0, goal=120.0),
 )
 
