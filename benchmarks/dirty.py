@@ -226,7 +226,7 @@ REFUSED, FAILED = "refused", "FAILED"  # FAILED: not by a sentence
 
 _FRAME = (Code.AXES, Code.LYING, Code.SIZE, Code.CALIBRATION)  # what is wrong with the whole cloud
 _BLURRED = (Code.POSES, Code.CLOCK, Code.DOUBLED, Code.ROUNDED)
-_SHAPE = (*_FRAME, *_BLURRED, Code.LEAN, Code.DENT, Code.UNSEEN, Code.PLACE, Code.UNEXPLAINED, Code.CUT)
+_SHAPE = (*_FRAME, *_BLURRED, Code.DENT, Code.UNSEEN, Code.PLACE, Code.UNEXPLAINED, Code.CUT)
 # The codes of the warnings that speak of each kind of fault.
 TOLD_BY: dict[str, tuple[Code, ...]] = {
     **dict.fromkeys(("walls", "width", "height", "floor", "aside"), _SHAPE),

@@ -44,7 +44,6 @@ class Code(StrEnum):
     # Shapes that no tunnel has
     DENT = "dent"  # A crown dented inwards
     GRADE = "grade"  # Steeper than any road or railway
-    LEAN = "lean"  # Floor and walls lean together
     LYING = "lying"  # A tunnel on its side
     SHAFT = "shaft"  # A vertical shaft
     SIZE = "size"  # Wider or higher than any tunnel, or smaller

@@ -82,26 +82,6 @@ def test_a_section_on_its_side_is_noticed(bore):
     assert "flat on the left" in codes(turned)["lying"]
 
 
-@pytest.mark.parametrize(
-    ("roll", "said"), [(0.5, None), (2.0, "by 2.0°, left side up"), (-3.0, "by 3.0°, right side up")]
-)
-def test_a_bore_that_leans_as_a_whole_is_noticed_and_its_likely_cause_is_named(bore, roll, said):
-    turn = np.exp(1j * np.deg2rad(roll))
-    outline = turn * bore.radius[0] * np.exp(1j * bore.angle) + 0.03  # the axis is not in the middle of what leans
-    turned = np.interp(bore.angle, np.angle(outline), np.abs(outline), period=2 * np.pi)
-    told = codes(replace(bore, radius=np.repeat(turned[None], len(bore.station), axis=0)))
-    assert (said in told["lean"] and "from 0 to 24 m" in told["lean"]) if said else told == {}
-    assert not said or "roll of the LiDAR's mount" in told["lean"]
-
-
-def test_a_floor_that_falls_to_one_side_under_upright_walls_is_no_lean(bore):
-    steepness = np.tan(np.deg2rad(2.0)) * np.cos(bore.angle) - np.sin(bore.angle)
-    fall = np.where(steepness > 0.1, 3.2 / steepness, np.inf)  # upward = -3.2 + left tan 2°
-    radius = np.where(np.sin(bore.angle) < 0, np.minimum(fall, 2.8 / np.abs(np.cos(bore.angle))), bore.radius)
-    assert np.ptp(radius[0] * np.sin(bore.angle) * (np.sin(bore.angle) < -0.8)) > 0.1, "the floor does not fall"
-    assert codes(replace(bore, radius=radius)) == {}
-
-
 def test_a_round_bore_along_z_is_a_shaft_and_one_with_a_floor_a_guess(bore):
     guessed = {**METRES, "axes": "x-zy (detected: longest along z, so y is taken as up)"}
     assert "taken as up" in codes(bore, guessed)["axes"]
