@@ -53,6 +53,7 @@ class BoardConfig:
     tunnels: int = 5  # Tunnels of each kind and split.
     further: tuple[str, ...] = ()  # Names or files of further tunnels, a column each.
     sensor: str = PLANAR  # The LiDAR of agents without a line in the roster, by name.
+    texture: float = 0.0  # Brightness of the walls, which agents get as intensities; 0 gives none.
     load: tuple[Path, ...] = ()  # Python files to run first, with things of one's own.
     memory: float = 8.0  # Memory for driving, GB; an agent that needs more drives in parts.
     report_only: bool = False  # Drive nothing.
@@ -67,6 +68,7 @@ class Job:
     setting: Setting
     agent: str
     sensor: str
+    texture: float = 0.0
 
 
 def choose_by_rule() -> None:
@@ -112,7 +114,7 @@ def jobs_of(config: BoardConfig) -> list[Job]:
                 fits = (not entry.tasks or task in entry.tasks) and (entry.hidden or not hidden)
                 if asked or fits:
                     sensor = config.sensor if entry.group == "other" else entry.sensor
-                    found.append(Job(Setting(task, hidden), agent, sensor))
+                    found.append(Job(Setting(task, hidden), agent, sensor, config.texture))
     return list(dict.fromkeys(found))
 
 
@@ -127,7 +129,8 @@ def enter(job: Job, tunnel: Any) -> tuple[Any, Any]:
     name = job.setting.task
     id = name if "/" in name else f"Subterra/{name}-v1"
     hidden: dict[str, Any] = {"hidden_start": True} if job.setting.hidden_start else {}
-    return st.make(id, tunnel=tunnel, estimates=True, sensor=job.sensor, **hidden)
+    shown: dict[str, Any] = {"intensity": True, "texture": job.texture} if job.texture else {}
+    return st.make(id, tunnel=tunnel, estimates=True, sensor=job.sensor, **hidden, **shown)
 
 
 def conditions(config: BoardConfig, sensor: str) -> str:
@@ -135,6 +138,8 @@ def conditions(config: BoardConfig, sensor: str) -> str:
     content: list[Any] = [st.constants_digest(), config.splits, config.episodes, config.tunnels, FIRST]
     if sensor != PLANAR:
         content.append(sensor)
+    if config.texture:
+        content.append(config.texture)
     if config.further:
         content.append([tunnel_digest(name) for name in config.further])
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]

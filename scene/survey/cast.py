@@ -9,7 +9,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from scene.survey.alignment import Alignment
+from scene.survey.alignment import MARGIN, Alignment
 from scene.survey.carrier import Carried, rotate
 from scene.survey.config import SensorErrors
 from scene.survey.lidar import SCAN_PERIOD, Lidar, Sweep
@@ -83,25 +83,29 @@ ALBEDO[[Part.FLOOR, Part.SLEEPER, Part.RAIL, Part.FASTENING]] = 0.20, 0.36, 0.42
 ALBEDO[Part.THING] = 0.35
 
 
+_NODE = 0.1  # m between the frames to which points are referred
+
+
 class Face:
     """Brightness of the lining, fixed to the wall: factors on its reflectivity."""
 
     def __init__(self, alignment: Alignment, section: Section, texture: float, seed: int) -> None:
-        self._alignment, self._section = alignment, section
-        self._texture, self._seed = texture, seed
+        self._section, self._texture, self._seed = section, texture, seed
+        self._nodes = np.arange(-MARGIN, alignment.length + MARGIN, _NODE)
+        self._frames = alignment.frames(self._nodes)
 
     def __call__(
         self, station: float, points: Float[np.ndarray, "n 3"], part: UInt8[np.ndarray, "n"]
     ) -> Float[np.ndarray, "n"]:
         """Return the factors of points on some parts, m in the survey frame, seen from about a station, m."""
         own = np.flatnonzero(np.isin(part, (Part.LINING, Part.JOINT, Part.POCKET, Part.FLOOR)))
-        at, shown = np.full(len(own), station), points[own]
+        at, shown, frames = np.full(len(own), station), points[own], self._frames
         for _ in range(3):
-            frames = self._alignment.frames(at)
-            away = shown - frames.position
-            at = at + np.einsum("ij,ij->i", away, frames.tangent)
-        left = np.einsum("ij,ij->i", away, frames.lateral)
-        above = np.einsum("ij,ij->i", away, frames.up) + 0.5 * self._section.height(at)
+            node = np.clip(np.rint((at + MARGIN) / _NODE).astype(int), 0, len(self._nodes) - 1)
+            away = shown - frames.position[node]
+            at = self._nodes[node] + np.einsum("ij,ij->i", away, frames.tangent[node])
+        left = np.einsum("ij,ij->i", away, frames.lateral[node])
+        above = np.einsum("ij,ij->i", away, frames.up[node]) + (0.5 * self._section.height(self._nodes))[node]
         factors = np.ones(len(part))
         factors[own] = brightness(np, at, wall_angle(np, left, above), self._seed, self._texture)
         return factors

@@ -8,8 +8,12 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
+from subterra_jax.baselines import scanmatch
+from subterra_jax.baselines.agent import observed
+from subterra_jax.baselines.steering import CentreLine
 from subterra_jax.host.errors import TunnelError
 from subterra_jax.host.texture import RING, brightness, texture_seed, wall_angle
+from subterra_jax.policies.locate import bends, strips
 
 TASK, HALF = "Subterra/TraverseShort-v1", 2.8
 
@@ -174,3 +178,43 @@ def test_a_bound_of_the_station_is_that_of_a_numeric_reference():
     plain = st.localisability(*st.make(TASK, tunnel=straight(), intensity=True), step=20.0)
     assert np.isinf(plain.by_range[0])
     assert np.isinf(plain.bound[0])
+
+
+def test_scan_matching_finds_the_shift_by_brightness_alone():
+    env, params = st.make(TASK, tunnel=straight(), intensity=True, texture=1.0)
+    zero, settings = jnp.zeros(()), scanmatch.MatchParams()
+
+    def sight(x, key):
+        state = placed(env, params, x)
+        flat = env.observe(state, env.draw_step(jax.random.key(key), (), params), params)
+        pose = scanmatch.AxisPose(jnp.float32(x), zero, zero, zero, jnp.float32(HALF))
+        obs = observed(env, params, flat)
+        return pose, obs, scanmatch.log_face(pose, obs, params)
+
+    faces, cost, plain = scanmatch.empty_profile(), 0.0, 0.0
+    walls = scanmatch.empty_profile()
+    for k in range(25):
+        pose, obs, face = sight(12.0 + 0.2 * k, k)
+        faces = scanmatch.add_scan(faces, pose, obs.ranges, settings, face)
+        walls = scanmatch.add_scan(walls, pose, obs.ranges, settings)
+    for k in range(20):
+        pose, obs, face = sight(18.0 + 0.2 * k, 50 + k)
+        off = dataclasses.replace(pose, station=pose.station + 0.1)
+        cost = cost + scanmatch.mismatch(faces, off, obs.ranges, settings, face)
+        plain = plain + scanmatch.mismatch(walls, off, obs.ranges, settings)
+    found = scanmatch.best_match(cost, settings)
+    assert bool(found.informative)
+    assert float(found.shift) == pytest.approx(-0.1, abs=0.03)
+    assert not bool(scanmatch.best_match(plain, settings).informative)
+
+
+def test_brightness_makes_further_sides_for_the_learnt_localiser():
+    env, params = st.make(TASK, tunnel=straight(), intensity=True)
+    flat = env.observe(placed(env, params, 20.0), env.draw_step(jax.random.key(3), (), params), params)
+    obs = observed(env, params, flat)
+    walls = CentreLine().begin(obs, params)
+    points, _ = bends.look(jnp.zeros(()), obs, walls, jnp.zeros(()), params)
+    assert points.n_sides == strips.n_sides(params.lidar) == 4
+    assert bool(points.seen[2:].any())
+    shown = np.asarray(points.out[2:])[np.asarray(points.seen[2:])]
+    assert np.abs(shown).mean() < 0.015  # an even wall: 5 % of noise and whole numbers, on the scale of 0.1 m
