@@ -151,7 +151,7 @@ def _draw_panel(axes: Axes, board: dict[str, Any], title: str, names: list[str])
     for k, program in enumerate(programs):
         found = [median_drift(board["rows"], program, name) or (np.nan,) * 3 for name in names]
         middle, low, high = np.maximum(np.array(found, float), _LEAST).T
-        colour, marker = _OURS.get(program) or (f"C{others.index(program) % 10}", "o")
+        colour, marker = _OURS.get(program) or (plt.get_cmap("tab20")(others.index(program) % 20), "o")
         place = at + _ASIDE * (k - 0.5 * (len(programs) - 1))
         axes.errorbar(
             place, middle, [middle - low, high - middle], fmt=marker, ms=4, lw=1.2, capsize=2, color=colour,
