@@ -48,7 +48,7 @@ _EVERY = 6  # firings of the VLP-16 of which one is kept
 _AVIA_RATE = 60_000  # points/s
 _COMPARED = 12  # sweeps of a recording that are compared point by point
 _LATE, _CLOCK = 0.005, 0.010  # s: errors of a point's time, and of a clock, that count as noise
-_APART, _LONGER = 0.010, 0.10  # m: of two walls, RMS, and of two bores' lengths, that count as noise
+_APART, _LONGER = 0.015, 0.10  # m: of two walls, RMS, and of two bores' lengths, that count as noise
 _MOST_BAD = 0.05  # share of bad times that the reader states as its limit
 _ODDS: dict[str, dict[Any, int]] = {  # of each value of a convention
     "point_times": {"driver": 3, "header": 5, "sweep": 4, "epoch": 4, "boot": 6, "constant": 1, "none": 1},

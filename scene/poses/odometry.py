@@ -63,14 +63,18 @@ class Tracker:
         points = self._unwound(scan, middle, guide, step, gap)
         near = points[np.linalg.norm(points, axis=1) < _RANGE]
         # One thread: sums in one order, so that the same recording gives the same bytes.
-        source, _ = small_gicp.preprocess_points(near, _THINNING, _NEIGHBOURS, num_threads=1)
+        if len(near):  # the library prints a warning of its own about none
+            source, _ = small_gicp.preprocess_points(near, _THINNING, _NEIGHBOURS, num_threads=1)
+        size = source.size() if len(near) else 0
         pose, weakest = last @ step, np.array([1.0, 0.0, 0.0])
-        if self.poses and source.size() >= MIN_POINTS:
+        if self.poses and size >= MIN_POINTS:
             result = small_gicp.align(self._map, source, pose, max_correspondence_distance=_REACH, num_threads=1)
             if result.num_inliers >= MIN_POINTS and np.isfinite(result.T_target_source).all():
                 weakest = _weakest_direction(result.H)
                 pose = _blend_poses(result, pose, *self._sigmas(guide))
-        self._accept(source, pose, middle)
+        if size >= MIN_POINTS or (size and not self.poses):
+            self._map.insert(source, pose)
+        self._accept(pose, middle)
         return weakest
 
     def trajectory(self, times: list[float], source: str) -> Trajectory:
@@ -78,9 +82,7 @@ class Tracker:
         stack = np.stack(self.poses)
         return Trajectory(np.array(times), stack[:, :3, 3], Rotation.from_matrix(stack[:, :3, :3]), source)
 
-    def _accept(self, source: small_gicp.PointCloud, pose: np.ndarray, middle: float) -> None:
-        if source.size() >= MIN_POINTS or not self.poses:
-            self._map.insert(source, pose)
+    def _accept(self, pose: np.ndarray, middle: float) -> None:
         if self.poses:
             self._step, self._pace = np.linalg.inv(self.poses[-1]) @ pose, middle - self._time
         self._time = middle
