@@ -356,7 +356,7 @@ def run(config: RecordingsConfig) -> int:
 def records_of(config: RecordingsConfig, rows: list[Row]) -> list[Record]:
     """Return the counts by kind, those of what times were taken for, and the differences of the bores."""
     command = f"benchmarks.recordings --count {config.count} --seed {config.seed} --out out/recordings"
-    further = {"n": config.count, "seed": config.seed, "split": f"drives of a VLP-16 and an Avia through {config.length:g} m"}
+    further = {"n": config.count, "seed": config.seed, "split": f"a VLP-16 and an Avia in {config.length:g} m"}
     found = Counter((kind, row.outcome) for row in rows for kind in properties(row))
     ids = {f"{_id(kind)}/{_id(outcome)}": found[kind, outcome]
            for kind in dict.fromkeys(kind for kind, _ in found) for outcome in OUTCOMES}  # fmt: skip
