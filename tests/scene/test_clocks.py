@@ -46,6 +46,12 @@ def test_a_lag_is_found_whatever_the_mount(lidar, late):
     assert find_lag(lidar, turns_of_poses(poses))[0] == pytest.approx(late, abs=0.6 * NOTICED)
 
 
+def test_a_carrier_that_hardly_turns_tells_no_lag(lidar):
+    turns = turns_of_gyro(gyro(0.1, Rotation.identity()))
+    calm = LidarTurns(lidar.start, lidar.end, 0.02 * lidar.rate)
+    assert find_lag(calm, lambda start, end: 0.02 * turns(start, end))[0] is None
+
+
 def test_turns_of_another_drive_and_none_at_all_tell_nothing(lidar):
     other = Trajectory(AT, np.zeros((len(AT), 3)), attitude(0.61 * AT + 500.0), "poses")
     assert find_lag(lidar, turns_of_poses(other))[0] is None

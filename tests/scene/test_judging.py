@@ -88,6 +88,8 @@ def test_what_lies_beyond_the_ends_is_counted_apart(bore, wall):
     assert judgement.shares["beyond_ends"] == pytest.approx(600 / 60_600, abs=1e-4)
     assert judgement.shares["inside"] + judgement.shares["behind"] < 1e-3
     assert (judgement.returns.kind[-600:] == BEYOND).all()
+    near = about(bore, [-0.3, bore.length + 0.3], [0.0, 0.0], [0.0, 0.0])
+    assert (compare_returns(bore, cloud_of(near), 0.10).kind == BEYOND).all()
 
 
 THINGS = {

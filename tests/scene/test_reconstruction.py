@@ -44,6 +44,11 @@ def test_frames_are_orthonormal_and_lateral_points_left():
     np.testing.assert_allclose(np.linalg.norm(steps, axis=1), np.diff(bore.station), rtol=1e-3)
 
 
+def test_an_axis_knows_its_bend_to_the_left_and_its_grade(bore):
+    np.testing.assert_allclose(bore.axis.curvature[30:-30], 1 / 60, rtol=0.02)
+    np.testing.assert_allclose(bore.axis.grade[30:-30], 0.01, rtol=0.02)
+
+
 def test_rails_and_people_do_not_move_floor_or_walls():
     known = curved_d_bore(length=30, radius=1e6, grade=0.0, yaw=0.0, offset=(0, 0, 0))
     rng = np.random.default_rng(1)
