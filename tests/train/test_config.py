@@ -40,8 +40,6 @@ def test_every_task_has_presets_that_make_sense(task, preset):
     assert preset == "cpu" or config.steps_per_iteration >= 50_000
 
 
-
-
 def test_steps_are_rounded_up_to_whole_iterations():
     config = dataclasses.replace(TrainConfig(), steps=1001, n_envs=10, unroll=10, minibatches=5)
     assert (config.steps_per_iteration, config.iterations, config.minibatch_envs) == (100, 11, 2)
