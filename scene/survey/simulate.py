@@ -145,7 +145,7 @@ def simulate(config: SurveyConfig, console: Console) -> str:
         if apart:
             pool = stack.enter_context(ProcessPoolExecutor(len(apart), multiprocessing.get_context("spawn")))
             stack.callback(pool.shutdown, cancel_futures=True)
-            waiting = [pool.submit(_simulate_device, *job, Console(quiet=True)) for job in apart]
+            waiting = [pool.submit(_simulate_device, *job) for job in apart]
         parts += [_simulate_device(*job, console) for job in jobs[: len(jobs) - len(apart)]]
         parts += [one.result() for one in waiting]
     return ", ".join(parts)
@@ -158,7 +158,7 @@ def _simulate_device(
     mesh: Mesh,
     face: Face | None,
     seed: np.random.SeedSequence,
-    console: Console,
+    console: Console | None = None,
 ) -> str:
     of_lidar, *of_imus = seed.spawn(1 + len(IMUS[name]))
     one, carried = make_device(name, config), Carried(walk, LIDARS[name])
@@ -175,7 +175,7 @@ def _simulate_device(
         cloud = None
         if config.cloud and name == config.sensors[0]:
             cloud = stack.enter_context(CloudWriter(stack.enter_context(replace_file(config.out / "cloud.ply"))))
-        progress = stack.enter_context(Progress(console=console, transient=True))
+        progress = stack.enter_context(Progress(console=console or Console(quiet=True), transient=True))
         tracked = progress.track(seen, total=count, description=f"survey, {name}")
         bag = config.out / f"survey{one.suffix}.bag"
         inertial = draw_imu_messages(of_imus, name, carried, config)
