@@ -1,10 +1,15 @@
 """The parts of a simulated survey, one by one: pattern, errors, sizes within tolerance."""
 
+import pickle
+from concurrent.futures import Future
+from contextlib import ExitStack
 from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from rich.console import Console
 
+from scene.survey import simulate
 from scene.survey.alignment import draw_railway, lay_out
 from scene.survey.bore import draw_bore
 from scene.survey.carrier import IMUS
@@ -217,3 +222,26 @@ def test_the_surface_has_the_sizes_that_the_truth_states(bores, tmp_path) -> Non
     assert np.median(np.diff(truth["rings"]["station"])) == pytest.approx(bore.furniture.sizes.ring_width, abs=1e-6)
     depth = {side: np.mean([p["depth"] for p in truth["pockets"] if p["side"] == side]) for side in ("left", "right")}
     assert depth["left"] != pytest.approx(depth["right"], abs=1e-4)
+
+
+class Sending(ExitStack):
+    """A pool of processes that does nothing with what another process would have to read."""
+
+    def __init__(self, *_: object) -> None:
+        super().__init__()
+
+    def submit(self, *job: object) -> Future[str]:
+        sent: Future[str] = Future()
+        sent.set_result(str(len(pickle.dumps(job))))
+        return sent
+
+    def shutdown(self, **_: object) -> None:
+        pass
+
+
+def test_a_further_lidar_of_a_long_survey_can_be_simulated_in_another_process(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(simulate, "_WORTH_A_PROCESS", 0.0)
+    monkeypatch.setattr(simulate, "ProcessPoolExecutor", Sending)
+    config = SurveyConfig(tmp_path, length=11.0, sensors=("vlp16", "os1"), scan_every=50)
+    said = simulate.simulate(config, Console(quiet=True))
+    assert int(said.split(", ")[-1]) > 100_000  # bytes
