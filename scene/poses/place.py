@@ -264,7 +264,7 @@ def _check_given(recording: Recording, given: Trajectory, reading: ReadingConfig
 
 def _check(recording: Recording, located: Located) -> Located:
     """Return poses with what they make of the walls among their facts: rails hide where they blur them."""
-    check = check_poses(recording, located.trajectory)
+    check = check_poses(recording, located.trajectory, False)
     return located if check is None else replace(located, facts={**located.facts, **check.facts})
 
 
