@@ -102,9 +102,9 @@ def test_it_drives_over_sleepers_and_slips(drive):
     where, _ = drive(1, 4.0, (0.8, 0.0))
     assert 1.5 < where[-1, 0] - where[0, 0] < 3.1
     assert -0.12 < where[:, 2].min() < where[:, 2].max() < 0.1
-    fast, _ = drive(1, 8.0, (1.2, 0.0), (10.0, 0.1, 0.0))
-    assert 7.0 < fast[-1, 0] - fast[0, 0] < 9.6
-    assert fast[:, 2].max() < 0.1, "it overturned"
+    for aside in (0.0, 0.1, -0.15):
+        fast, _ = drive(1, 6.0, (1.5, 0.05), (10.0, aside, 0.0))
+        assert fast[:, 2].max() < 0.1, "it leaps"
 
 
 def test_energy_does_not_come_from_nothing(drive):
