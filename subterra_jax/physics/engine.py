@@ -160,10 +160,11 @@ class Engine:
         model = self.model
         if build is None:
             return model
-        trunk, pairs = self.host.body(self.machine.trunk).id, N_PLANES * len(self.machine.treads)
+        trunk, treads = self.host.body(self.machine.trunk).id, self._ids(self.host, self.machine.treads)
+        pairs = np.flatnonzero(np.isin(self.host.pair_geom1, treads) | np.isin(self.host.pair_geom2, treads))
         bias = model.actuator_biasprm.at[:, 1].multiply(build.stiffness).at[:, 2].multiply(build.damping)
         return model.replace(
-            pair_friction=model.pair_friction.at[:pairs, :2].set(build.friction),
+            pair_friction=model.pair_friction.at[pairs, :2].set(build.friction),
             body_mass=model.body_mass * build.mass,
             body_inertia=model.body_inertia * build.mass,
             body_ipos=model.body_ipos.at[trunk].set(model.body_ipos[trunk] + build.shift),

@@ -1,13 +1,16 @@
 """The robot's MJCF against its figures."""
 
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
 from subterra_jax.b2 import constants as b2
 from subterra_jax.b2.kinematics import standing_pose
-from subterra_jax.b2.model import robot_spec
+from subterra_jax.b2.model import B2, robot_spec
 from subterra_jax.host.rover import GROUND
+from subterra_jax.physics.engine import Build, Engine
+from subterra_jax.physics.ground import N_PLANES
 from tests.subterra_jax.b2.conftest import standing
 
 # Principal moments, from MuJoCo's own reading of the URDF (trunk) and from the mean leg, kg m².
@@ -96,3 +99,15 @@ def test_only_feet_touch_the_ground_and_only_the_bumpers_walls(model):
     touching = {model.geom(k).name: model.geom_conaffinity[k] for k in range(model.ngeom)}
     assert touching == {"trunk": 0, **dict.fromkeys(b2.BUMPERS, 8), **{f"{leg}_foot": 4 for leg in b2.LEGS}}
     assert (model.geom_contype == 0).all()
+
+
+def test_the_friction_that_is_drawn_is_that_of_the_feet_and_of_nothing_else():
+    engine = Engine(B2)
+    build = Build(jnp.asarray(0.33), jnp.ones(()), jnp.zeros(3), jnp.ones(12), jnp.ones(12))
+    host, friction = engine.host, np.asarray(engine.model_of(build).pair_friction[:, 0])
+    touching = [{host.geom(g).name for g in pair} for pair in zip(host.pair_geom1, host.pair_geom2, strict=True)]
+    feet = np.array([bool(names & set(engine.machine.treads)) for names in touching])
+    assert feet.sum() == N_PLANES * 4
+    assert (~feet).sum() == 2
+    np.testing.assert_allclose(friction[feet], 0.33, rtol=1e-6)
+    np.testing.assert_array_equal(friction[~feet], host.pair_friction[~feet, 0].astype(np.float32))
