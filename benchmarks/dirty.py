@@ -67,7 +67,7 @@ def find_cases(folder: Path, only: tuple[str, ...] = ()) -> list[Case]:
 
     Args:
         folder: Folder with `NAME.laz`, or another input called `NAME`, beside each `NAME_truth.npz`.
-        only: Beginnings of the names wanted; all where it is empty.
+        only: Beginnings of the names needed; all where it is empty.
 
     Raises:
         BenchmarkError: The folder holds no case of such a name, or a truth has no input beside it.
@@ -305,7 +305,7 @@ class JudgeConfig:
 
     folder: Annotated[Path, tyro.conf.Positional]  # Folder with inputs and their `NAME_truth.npz`.
     out: Path  # Folder for results and logs; cases with a result there are not built again.
-    only: tuple[str, ...] = ()  # Beginnings of the names of the cases wanted; all if not given.
+    only: tuple[str, ...] = ()  # Beginnings of the names of the cases needed; all if not given.
     flags: str = ""  # Further words for the builder, in one string.
     keep: bool = False  # Keep the scenes in `OUT/scenes`.
 

@@ -301,11 +301,11 @@ def command(
 
 def main() -> int:
     """Runs the command and returns its exit status."""
-    wanted = parse(lambda words: tyro.cli(command, prog="python -m scene.build", args=words))
+    needed = parse(lambda words: tyro.cli(command, prog="python -m scene.build", args=words))
 
     def act() -> None:
         try:
-            wanted()
+            needed()
         except FitError as error:
             raise error.about(f"{error} [{error.code}]") from error
 

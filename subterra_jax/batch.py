@@ -94,9 +94,9 @@ class AutoReset:
     def _checked(self, action: Any, state: State) -> Array:
         action, n_envs = jnp.asarray(action), jax.tree.leaves(state)[0].shape[0]
         if action.ndim != 2 or action.shape[0] != n_envs:
-            wanted = f"({n_envs}, {getattr(self.env, 'action_size', 'n_action')})"
+            needed = f"({n_envs}, {getattr(self.env, 'action_size', 'n_action')})"
             raise ValueError(
-                f"actions of {n_envs} environments must have shape {wanted}, got an array of shape {action.shape}"
+                f"actions of {n_envs} environments must have shape {needed}, got an array of shape {action.shape}"
             )
         return action
 
@@ -113,13 +113,13 @@ class AutoReset:
         The fused kernels take all scans in one go and skip those that nobody wants, of environments that have not
         finished.
         """
-        if self.env.skips_unwanted(params):
+        if self.env.skips_unneeded(params):
             twice = lambda one, other: jnp.concatenate([one, other])  # noqa: E731
             both_states, both_noises = jax.tree.map(twice, (merged, noise), (stepped, noise))
             both_params = self._of_batched(params, lambda leaf: twice(leaf, leaf))
-            wanted = twice(jnp.ones_like(done), done)
+            needed = twice(jnp.ones_like(done), done)
             observe = jax.vmap(self.env.observe, in_axes=(0, 0, self.params_axes, 0))
-            obs, final = jnp.split(observe(both_states, both_noises, both_params, wanted), 2)
+            obs, final = jnp.split(observe(both_states, both_noises, both_params, needed), 2)
             return obs, jnp.where(done[:, None], final, obs)
         obs = self._vmap(self.env.observe, 2)(merged, noise, params)
         return obs, self._final(done, stepped, noise, params, obs)

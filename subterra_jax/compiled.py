@@ -105,7 +105,7 @@ def cache_programs(folder: str | Path | None = None) -> Path:
 
 
 def keep_programs() -> None:
-    """Do as `cache_programs`, unless JAX has a folder or is told to keep nothing, or the folder cannot be written."""
+    """Do as `cache_programs`, unless JAX has a folder or is asked to keep nothing, or the folder cannot be written."""
     config: Any = jax.config
     if config.jax_compilation_cache_dir is None and config.jax_enable_compilation_cache:
         with contextlib.suppress(SubterraError):

@@ -131,7 +131,7 @@ def ask(
     """Ask an agent for an action; it gets only the inputs that it declares.
 
     Args:
-        state: The true state, of which only a privileged agent is told.
+        state: The true state, of which only a privileged agent is given.
         here: The task in the tunnel that the robot is in.
     """
     known = env.privileged(state, here) if agent.privileged else None

@@ -42,7 +42,7 @@ def collect_entries(env: TunnelEnv, overrides: Mapping[str, Any]) -> dict[str, A
 
 def make_params(env: TunnelEnv, tunnel: Any, horizon: Any, entries: Mapping[str, Any]) -> EnvParams:
     """Make params whose every leaf is a 32-bit array; a weakly typed one would compile each function a second time."""
-    return as_arrays(EnvParams(tunnel=tunnel, horizon=horizon, parts=FrozenDict(entries), errand=env.rule.errand))
+    return as_arrays(EnvParams(tunnel=tunnel, horizon=horizon, parts=FrozenDict(entries), goal_kind=env.rule.goal_kind))
 
 
 def check_robot(entries: Mapping[str, Any]) -> None:

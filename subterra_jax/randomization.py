@@ -63,7 +63,7 @@ def randomize(
     if n_envs < 1:
         raise ValueError(f"n_envs must be at least 1, got {n_envs}")
     leaves = {name: _find(params, name) for name in ranges}
-    bounds = {name: _bounds(name, wanted, leaves[name]) for name, wanted in ranges.items()}
+    bounds = {name: _bounds(name, needed, leaves[name]) for name, needed in ranges.items()}
     _check(params, bounds)
     axes = jax.tree.map(lambda _: None, params)
     for name, leaf in leaves.items():
@@ -107,10 +107,10 @@ def _fields(node: Any) -> dict[str, bool]:
     return {field.name: field.metadata.get("pytree_node", True) for field in dataclasses.fields(node)}
 
 
-def _bounds(name: str, wanted: Range, leaf: Array) -> tuple[int | float, int | float]:
+def _bounds(name: str, needed: Range, leaf: Array) -> tuple[int | float, int | float]:
     """Least and largest value of a range, or what is wrong with it."""
-    log = isinstance(wanted, LogUniform)
-    low, high = (wanted.low, wanted.high) if isinstance(wanted, LogUniform) else wanted
+    log = isinstance(needed, LogUniform)
+    low, high = (needed.low, needed.high) if isinstance(needed, LogUniform) else needed
     if not (np.isfinite(low) and np.isfinite(high) and low <= high):
         raise ValueError(f"range of {name!r} must be finite and not empty, got {low} to {high}")
     if log and low <= 0.0:

@@ -56,12 +56,12 @@ def axes_of(*trees: Any) -> frozenset[str]:
 
 def vary_like(tree: Any, *others: Any) -> Any:
     """Declare that every array varies along the axes of a `jax.shard_map` along which it or the others do."""
-    wanted = axes_of(tree, *others)
-    if not wanted:
+    needed = axes_of(tree, *others)
+    if not needed:
         return tree
 
     def one(leaf: Any) -> Any:
-        missing = tuple(wanted - axes_of(leaf))
+        missing = tuple(needed - axes_of(leaf))
         return jax.lax.pcast(leaf, missing, to="varying") if missing else leaf
 
     return jax.tree.map(one, tree)

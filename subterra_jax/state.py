@@ -26,10 +26,10 @@ def as_array(value: Any, like: Any = None) -> Any:
 
     Args:
         value: A number or an array; anything else is returned unchanged, and so is an array of random keys.
-        like: Array whose type is wanted; None makes integers int32 and everything else float32.
+        like: Array whose type is needed; None makes integers int32 and everything else float32.
 
     Raises:
-        ValueError: Integers are wanted and a Python number is none.
+        ValueError: Integers are needed and a Python number is none.
     """
     wants_whole = like is not None and jnp.issubdtype(like.dtype, jnp.integer)
     if wants_whole and isinstance(value, float) and not value.is_integer():
@@ -37,8 +37,8 @@ def as_array(value: Any, like: Any = None) -> Any:
     if not isinstance(value, _NUMBERS) or jax.dtypes.issubdtype(jnp.result_type(value), jax.dtypes.extended):
         return value
     whole = jnp.issubdtype(jnp.result_type(value), jnp.integer)
-    wanted = (jnp.int32 if whole else jnp.float32) if like is None else like.dtype
-    return jax.lax.convert_element_type(value, wanted)
+    needed = (jnp.int32 if whole else jnp.float32) if like is None else like.dtype
+    return jax.lax.convert_element_type(value, needed)
 
 
 def as_arrays(tree: Any) -> Any:
@@ -87,7 +87,7 @@ class _Named:
         the new ones.
 
         Raises:
-            ValueError: There is no such field or part, or a whole number is wanted.
+            ValueError: There is no such field or part, or a whole number is needed.
         """
         own = {field.name for field in dataclasses.fields(self)}  # type: ignore[arg-type]
         if unknown := set(updates) - own - set(self.parts):
@@ -154,7 +154,7 @@ class _StatesOfParts(_Named):
     legs: _Entry[Any] = _Entry()  # of `b2.mission`
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=["tunnel", "horizon", "parts"], meta_fields=["errand"])
+@partial(jax.tree_util.register_dataclass, data_fields=["tunnel", "horizon", "parts"], meta_fields=["goal_kind"])
 @dataclasses.dataclass(frozen=True)
 class EnvParams(_ParamsOfParts):
     """Everything about a task that is data. Every leaf may be vmapped.
@@ -164,13 +164,13 @@ class EnvParams(_ParamsOfParts):
         horizon: Steps after which an episode is truncated.
         parts: Params of the robot, of each part and of the rule, by name. Those of the package are attributes too.
             Frozen, so that a tree of axes can be hashed, as a static argument must.
-        errand: What an agent is asked to do: `cover`, `stop`, `return` or `report`. Static.
+        goal_kind: What an agent is asked to do: `cover`, `stop`, `return` or `report`. Static.
     """
 
     tunnel: Tunnel
     horizon: Any
     parts: FrozenDict[str, Any]
-    errand: str = "cover"
+    goal_kind: str = "cover"
 
 
 @partial(

@@ -28,7 +28,7 @@ from subterra_jax.parts.spatial_lidar import SENSORS, SpatialLidar, SpatialParam
 from subterra_jax.parts.wander import WanderParams
 from subterra_jax.procedural import expand, open_world
 from subterra_jax.rules import GoalParams, Relocalise, Rule, StartParams, StopAt, Traverse, TurnBack
-from subterra_jax.rules.rule import ERRANDS
+from subterra_jax.rules.rule import GOAL_KINDS
 from subterra_jax.state import EnvParams
 from subterra_jax.tunnel.sources import Source, resolve
 from subterra_jax.tunnel_env import TunnelEnv
@@ -109,7 +109,7 @@ def register(
         tunnel: Tunnel where none is named, as `subterra-351`; None for some of the open world.
 
     Raises:
-        ValueError: The id belongs to the benchmark, has another form, or the rule's errand is unknown.
+        ValueError: The id belongs to the benchmark, has another form, or the rule's goal kind is unknown.
     """
     if id in BENCHMARK:
         raise ValueError(f"{id} is a task of the benchmark; register yours under another id")
@@ -118,8 +118,10 @@ def register(
         raise ValueError(f"a task's id must read Namespace/Name-v1, got {id!r}")
     if not isinstance(rule, Rule):
         raise ValueError(f"{id}: rule must be a subterra_jax.rules.Rule, got {type(rule).__name__}")
-    if rule.errand not in ERRANDS:
-        raise ValueError(f"{id}: errand must be one of {', '.join(ERRANDS)}, {type(rule).__name__} has {rule.errand!r}")
+    if rule.goal_kind not in GOAL_KINDS:
+        raise ValueError(
+            f"{id}: goal_kind must be one of {', '.join(GOAL_KINDS)}, {type(rule).__name__} has {rule.goal_kind!r}"
+        )
     TASKS[id] = Task(rule, horizon, piece, tuple(parts), dict(params or {}), tunnel)
     if importlib.util.find_spec("gymnasium") is not None:
         register_tasks((id,))
@@ -188,7 +190,7 @@ def make(
             the tasks that report a start: `StopAt`, `StopAtShort`, `Return`, `Obstructed` and `Faulted`.
         split: In place of `tunnel`, those of another split of the open world: `train`, `val`, `test-seen` or
             `test-unseen`.
-        motion: `wheels`, a unicycle that does what it is told; or `rover`, a Scout 2.0 with mass by physics in MJX,
+        motion: `wheels`, a unicycle that does what it is given; or `rover`, a Scout 2.0 with mass by physics in MJX,
             with the same observations, rewards and ends. Then `engine="mujoco"` computes it in MuJoCo's own C, and
             `scene=` names the folder of a built scene to do that in.
         **overrides: Entries of `EnvParams` to replace: `horizon=100`, `lidar=LidarParams(range_sigma=0.0)`. `slip`,

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from subterra_jax.actions import COMMAND, ESTIMATE, REPORT, action_bounds, check_action, read_report
 from subterra_jax.compiled import compiled
 from subterra_jax.env import Box, Info, Stepped
-from subterra_jax.parts import Drive, Motion, Moved, Noise, Odometer, Part, PlanarLidar, Sight, Step, Unicycle
+from subterra_jax.parts import Drive, Motion, Moved, Noise, Odometer, Part, PlanarLidar, SensingState, Step, Unicycle
 from subterra_jax.parts.part import Batch, Bounds
 from subterra_jax.parts.unicycle import clearance, in_contact, wrap
 from subterra_jax.rows import vary_like
@@ -197,29 +197,29 @@ class TunnelEnv:
         return vary_like(after), reward, terminated, (steps >= params.horizon) & ~terminated, info
 
     def observe(
-        self, state: State, noise: Mapping[str, Any], params: EnvParams, wanted: Any = True
+        self, state: State, noise: Mapping[str, Any], params: EnvParams, needed: Any = True
     ) -> Float[Array, n_obs]:
         """Observe a state.
 
         Args:
-            wanted: Someone will read the observation; where not, ranges may be anything.
+            needed: Someone will read the observation; where not, ranges may be anything.
 
         Returns:
             Noisy ranges (m), dead-reckoned distance (m) and heading (rad), then the further entries of `fields`.
         """
         tunnel = params.tunnel.pick(state.tunnel)
-        sight = self._sight(state, noise, tunnel, params, wanted)
+        sensing = self._sensing(state, noise, tunnel, params, needed)
         entries: dict[str, Array] = {}
         for source in self._observers():
             if isinstance(source, Rule):
                 entries |= source.observe(state, tunnel)
             else:
                 own, of_part = state.parts[source.name], noise.get(source.name, _NOTHING)
-                entries |= source.observe(own, sight, of_part, params)
+                entries |= source.observe(own, sensing, of_part, params)
         return jnp.concatenate([jnp.atleast_1d(entry) for entry in entries.values()])
 
-    def skips_unwanted(self, params: EnvParams) -> bool:
-        return any(part.skips_unwanted(params) for part in self.parts)
+    def skips_unneeded(self, params: EnvParams) -> bool:
+        return any(part.skips_unneeded(params) for part in self.parts)
 
     @property
     def action_size(self) -> int:
@@ -317,25 +317,27 @@ class TunnelEnv:
             step = dataclasses.replace(step, after={**step.after, part.name: own})
         return step
 
-    def _sight(self, state: State, noise: Mapping[str, Any], tunnel: Tunnel, params: EnvParams, wanted: Any) -> Sight:
+    def _sensing(
+        self, state: State, noise: Mapping[str, Any], tunnel: Tunnel, params: EnvParams, needed: Any
+    ) -> SensingState:
         """The moment that sensors show, and the obstacles and faults between them and the walls."""
-        sight = Sight(tunnel, state.position, state.heading, state.station, state.parts, wanted)
+        sensing = SensingState(tunnel, state.position, state.heading, state.station, state.parts, needed)
         for part in self.parts:
-            sight = part.look_from(state.parts[part.name], sight, params)
+            sensing = part.look_from(state.parts[part.name], sensing, params)
 
         def hits(directions: Array) -> Any:
             nearest: Any = np.inf
             for part in self.parts:
-                nearest = jnp.minimum(nearest, part.hits(state.parts[part.name], sight, directions, params))
+                nearest = jnp.minimum(nearest, part.hits(state.parts[part.name], sensing, directions, params))
             return nearest
 
-        def spoil(ranges: Array) -> Array:
+        def corrupt(ranges: Array) -> Array:
             for part in self.parts:
                 own, of_part = state.parts[part.name], noise.get(part.name, _NOTHING)
-                ranges = part.spoil(own, ranges, of_part, params)
+                ranges = part.corrupt(own, ranges, of_part, params)
             return ranges
 
-        return dataclasses.replace(sight, hits=hits, spoil=spoil)
+        return dataclasses.replace(sensing, hits=hits, corrupt=corrupt)
 
     def _info(
         self, step: Step, moved: Moved, verdict: Verdict, clear: Float[Array, ""], contact: Bool[Array, ""]

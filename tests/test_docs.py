@@ -36,7 +36,7 @@ LOADED = re.compile(r"""(?:@import|url\()\s*["']?(?:https?:)?//[^"')]+""")
 
 
 class _Read(BaseException):
-    """A command line has been understood; nothing further is wanted of it."""
+    """A command line has been understood; nothing further is needed of it."""
 
 
 def _commands() -> list[list[str]]:

@@ -173,7 +173,7 @@ class Twice(Part):
 
     name = "twice"
 
-    def observe(self, own, sight, noise, params):
+    def observe(self, own, sensing, noise, params):
         return {"odometry": jnp.zeros(2)}
 
     def space(self, params):

@@ -107,7 +107,7 @@ def unknown(source: str) -> set[str]:
 
 
 def test_no_name_is_used_that_nobody_made() -> None:
-    """The linters are told to leave names alone: shapes of arrays look like some."""
+    """The linters are asked to leave names alone: shapes of arrays look like some."""
     for room in ROOMS:
         for path in files(room):
             assert not unknown(path.read_text()), f"{path.relative_to(ROOT)}"

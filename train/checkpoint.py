@@ -43,22 +43,22 @@ class Stored:
 
         Args:
             name: Name that it was saved under.
-            like: A tree of the same structure, its leaves of the shapes and types wanted, as from `jax.eval_shape`.
+            like: A tree of the same structure, its leaves of the shapes and types needed, as from `jax.eval_shape`.
 
         Raises:
             CheckpointError: An array is missing, or of another shape or type.
         """
         paths, structure = jax.tree_util.tree_flatten_with_path(like)
         leaves = []
-        for path, wanted in paths:
+        for path, needed in paths:
             place = _place(name, path)
             if place not in self.arrays:
                 raise CheckpointError(f"{self.path}: has no {place}; it was made for another network")
             leaf = self.arrays[place]
-            if leaf.shape != wanted.shape or leaf.dtype != wanted.dtype:
+            if leaf.shape != needed.shape or leaf.dtype != needed.dtype:
                 raise CheckpointError(
                     f"{self.path}: made for another network: {place} is {leaf.dtype}{list(leaf.shape)}, "
-                    f"this one needs {wanted.dtype}{list(wanted.shape)}"
+                    f"this one needs {needed.dtype}{list(needed.shape)}"
                 )
             leaves.append(leaf)
         return jax.tree.unflatten(structure, leaves)

@@ -188,12 +188,12 @@ def make_config(task: str, preset: str = "cpu", memory: str = "none") -> TrainCo
     if preset == "gpu":
         settings |= {**_GPU, **_BY_MEMORY.get(memory, {})}
     if task in TASKS:
-        covers = TASKS[task].rule.errand == "cover"
+        covers = TASKS[task].rule.goal_kind == "cover"
         if covers:
             settings |= _COVER | (_GPU_COVER if preset == "gpu" else {})
         elif preset == "cpu":
             settings |= _CPU_GOAL
-        if TASKS[task].rule.errand == "stop":
+        if TASKS[task].rule.goal_kind == "stop":
             settings |= _STOP
     return TrainConfig(**settings)
 

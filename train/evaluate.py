@@ -78,7 +78,7 @@ class Command:
     tunnel: Path | None = None
     lining: str | None = None  # variant of the walls; the tunnel's usual one if left out
     episodes: int = N_LISTED  # episodes to drive, the first of the task's 500
-    # go without a part, for an ablation: the `start` is told 40 m off; `front`: the localiser reads no walls;
+    # go without a part, for an ablation: the `start` is reported 40 m off; `front`: the localiser reads no walls;
     # `walls`: no beam has an echo; `odometry` stands still; `memory`: the way is dead-reckoned
     without: Part | None = None
     json: bool = False  # one line of JSON instead of a table

@@ -64,7 +64,7 @@ class RunFolder:
             overwrite: Throw away the run that the folder holds.
 
         Raises:
-            RunFolderError: It holds a run already, and neither is wanted.
+            RunFolderError: It holds a run already, and neither is needed.
             CheckpointError: As `resume`.
             ConfigError: As `resume`.
         """

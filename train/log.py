@@ -136,7 +136,7 @@ class Interrupt:
     """A request of the user, or of the machine's scheduler, to stop."""
 
     def __init__(self) -> None:
-        self.wanted = False
+        self.needed = False
 
 
 @contextmanager
@@ -145,9 +145,9 @@ def deferred_interrupt() -> Iterator[Interrupt]:
     interrupt = Interrupt()
 
     def note(number: int, frame: Any) -> None:
-        if interrupt.wanted:
+        if interrupt.needed:
             raise KeyboardInterrupt
-        interrupt.wanted = True
+        interrupt.needed = True
 
     before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
     try:

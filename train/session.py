@@ -133,7 +133,7 @@ def train_sessions(
     with deferred_interrupt() as interrupt:
 
         def stop() -> bool:
-            return interrupt.wanted
+            return interrupt.needed
 
         def watch(k: int, now: Snapshot) -> None:
             bar.show(now.record, of=labels[k])
@@ -147,7 +147,7 @@ def train_sessions(
                 session.close()
         for session, snapshot in zip(sessions, last, strict=True):
             session.finish(snapshot)
-        if interrupt.wanted:
+        if interrupt.needed:
             done = max(snapshot.iteration for snapshot in last)
             print(f"interrupted after {done} iterations; go on with --resume", file=sys.stderr)
             return None

@@ -26,7 +26,7 @@ from train.snapshot import Trainable
 from train.world import World
 
 # Tasks in which a localiser is of use.
-_ERRANDS = {"along": ("stop", "return"), "map": ("stop", "return", "report")}
+_GOAL_KINDS = {"along": ("stop", "return"), "map": ("stop", "return", "report")}
 
 
 def make_layout(env: Any, params: Any, config: TrainConfig, given: Given | None = None) -> Layout:
@@ -51,7 +51,7 @@ def make_layout(env: Any, params: Any, config: TrainConfig, given: Given | None 
     # What the filter believes is the report, and the network is left with the command.
     n_action = 2 if config.memory == "map" else len(bounds.low)
     asks = config.auxiliary and config.memory == "gru"
-    if config.auxiliary and env.rule.errand not in ("stop", "return"):
+    if config.auxiliary and env.rule.goal_kind not in ("stop", "return"):
         raise ConfigError(f"auxiliary = True asks for the way to a goal, and {env.id} has none")
     shape = Shape(
         n_inputs=jax.eval_shape(look, flat).shape[0],
@@ -98,11 +98,11 @@ def _check_world(env: Any, params: Any, config: TrainConfig, given: Policy) -> N
         raise ConfigError(
             f"unroll = {config.unroll} must be shorter than an episode of {env.id}, {params.horizon} steps"
         )
-    errands = _ERRANDS.get(config.memory)
-    if errands is not None and env.rule.errand not in errands:
+    goal_kinds = _GOAL_KINDS.get(config.memory)
+    if goal_kinds is not None and env.rule.goal_kind not in goal_kinds:
         raise ConfigError(
-            f"memory = {config.memory} is for tasks that ask to {' or '.join(errands)}, and {env.id} asks to "
-            f"{env.rule.errand}"
+            f"memory = {config.memory} is for tasks that ask to {' or '.join(goal_kinds)}, and {env.id} asks to "
+            f"{env.rule.goal_kind}"
         )
     if config.memory != "along":
         if config.begin_from is not None and given.network is None:
@@ -130,9 +130,9 @@ def _fitting(driver: Driver, given: Policy, config: TrainConfig) -> Policy:
     """
     if given.network is None:
         return given
-    wanted, source = flat(jax.eval_shape(driver.init, jax.random.key(0))), config.begin_from
+    needed, source = flat(jax.eval_shape(driver.init, jax.random.key(0))), config.begin_from
     found = flat(given.network)
-    for name, leaf in wanted.items():
+    for name, leaf in needed.items():
         tensor = found.get(name)
         wider = None if tensor is None else _widened(tensor, leaf.shape, config.frames)
         if wider is None:
@@ -141,7 +141,7 @@ def _fitting(driver: Driver, given: Policy, config: TrainConfig) -> Policy:
                 f"begin_from = {source} has another network: {name} is {tuple(leaf.shape)} here and has {has} there"
             )
         found[name] = wider
-    return dataclasses.replace(given, network=nested({name: found[name] for name in wanted}))
+    return dataclasses.replace(given, network=nested({name: found[name] for name in needed}))
 
 
 def _widened(tensor: np.ndarray, shape: tuple[int, ...], frames: int) -> np.ndarray | None:

@@ -1,4 +1,4 @@
-"""Ablations: a trained policy that goes without one of the things it is told, senses or keeps."""
+"""Ablations: a trained policy that goes without one of the things it is reported, senses or keeps."""
 
 import dataclasses
 from typing import Any, Literal
@@ -62,9 +62,9 @@ def without(agent: Any, part: Part) -> Any:
 
     Args:
         agent: The policy.
-        part: `start` is told 40 m off; `front`: what the walls tell its localiser; `walls`: every beam is without an
-            echo, for localiser and steering; `odometry` stands still; `memory`: the way to go is dead-reckoned, and a
-            GRU forgets.
+        part: `start` is reported 40 m off; `front`: what the walls tell its localiser; `walls`: every beam is without
+            an echo, for localiser and steering; `odometry` stands still; `memory`: the way to go is dead-reckoned, and
+            a GRU forgets.
 
     Raises:
         ConfigError: It has no such part.

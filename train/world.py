@@ -135,7 +135,7 @@ def open_world(
         TunnelError: The tunnel file is missing or wrong, or has no such lining.
     """
     task = require_task(task)
-    if tunnel is None and st.TASKS[task].rule.errand != "cover":
+    if tunnel is None and st.TASKS[task].rule.goal_kind != "cover":
         tunnel = _TUNNELS[preset or "cpu"]
     chosen = {"hidden_start": hidden_start, "intensity": intensity, "texture": texture}
     world = _open(task, tunnel, lining, sensor, chosen)

@@ -144,11 +144,11 @@ def scores_of(cells: Cells, setting: Setting) -> dict[str, dict[Key, Score]]:
 
 def over_split(cells: Cells, setting: Setting, agent: str, split: str) -> Score | None:
     """Return the score of an agent over all kinds of a split; None where it was not driven in all of them."""
-    wanted = {key for key in keys_of(cells) if key[0] == split}
+    needed = {key for key in keys_of(cells) if key[0] == split}
     for cell in cells:
         there = {(column["split"], column["kind"]) for column in cell["columns"]}
-        if setting_of(cell) == setting and cell["agent"] == agent and wanted <= there:
-            return summarise(cell, wanted)
+        if setting_of(cell) == setting and cell["agent"] == agent and needed <= there:
+            return summarise(cell, needed)
     return None
 
 

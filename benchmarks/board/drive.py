@@ -201,7 +201,7 @@ def drive(config: BoardConfig, missing: list[Job]) -> None:
 
 def floors_of(params: Any, n: int) -> list[float] | None:
     """Return the floor in each tunnel; None where nobody has derived one, as for a task of one's own."""
-    if params.errand == "cover" or "slip" not in params.parts:
+    if params.goal_kind == "cover" or "slip" not in params.parts:
         return None
     return [round(floor(params, index), 4) for index in range(n)]
 

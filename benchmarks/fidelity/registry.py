@@ -140,7 +140,7 @@ def compute_metric(case: Case, row: Metric) -> Value:
         return found if isinstance(found, Value) else number(float(found))
     except ImportError as error:
         return missing(f"{error.name} is not installed")
-    except Exception as error:  # a spoilt candidate may break any library
+    except Exception as error:  # a corrupted candidate may break any library
         return Value(None, None, 0, f"{type(error).__name__}: {error}"[:200], failed=True)
 
 

@@ -152,7 +152,7 @@ def name_bodies(
     behind: Float[np.ndarray, " n"],
     supported: Bool[np.ndarray, " n"],
 ) -> Int[np.ndarray, " n"]:
-    """Return the causes, with connected returns off the bore told apart by depth and distance.
+    """Return the causes, with connected returns off the bore distinguished by depth and distance.
 
     `behind` is how far each point is behind the wall, m.
     """

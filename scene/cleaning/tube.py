@@ -211,7 +211,7 @@ def _attached(narrower: np.ndarray, present: np.ndarray, wall: np.ndarray) -> Bo
 # Pipes, trays and ducts that hang free under a ceiling all along hide it in some directions, and are no wall: a wall
 # goes on to both sides. Where a section comes nearer at once and as suddenly goes back, and what is between lies inside
 # the straight line from one edge to the other, it is a thing in the bore, however long it is.
-_OVERHEAD = 0.35  # sine of the lowest direction: what stands on the floor or leans on a wall is told elsewhere
+_OVERHEAD = 0.35  # sine of the lowest direction: what stands on the floor or leans on a wall is reported elsewhere
 _EDGE = 0.4  # m at both edges
 _WITHIN_LINE = 0.3  # m within the line between them
 _WIDEST_HANGING = np.deg2rad(60.0)  # rad, of a thing under a ceiling

@@ -271,14 +271,14 @@ def add_standard_lining(
     the lowest part of the section, gets no pockets. `joints` are ring joints that the survey tells, m, between which
     universal rings stand.
     """
-    wanted = config.lay == "standard" or (config.lay == "auto" and railway)
-    if config.kind == "universal" and wanted:
+    needed = config.lay == "standard" or (config.lay == "auto" and railway)
+    if config.kind == "universal" and needed:
         return _add_universal_lining(bore, config, flat_floor, joints)
     rings = {"rings": MEASURED} if len(bore.ring_station) else {"rings": STANDARD}
     joints = np.arange(config.ring_width / 2, bore.length, config.ring_width)
     joints = joints[_is_even(bore, joints)]
     pockets = _standard_pockets(bore, joints, config, flat_floor)
-    if not wanted or not len(pockets):
+    if not needed or not len(pockets):
         provenance = rings if len(bore.ring_station) else {"rings": "none"}
         return bore, {**provenance, "pockets": "none: the survey cannot show them", "nails": "none"}
     bore = replace(bore, pocket=pockets, ring_station=bore.ring_station if len(bore.ring_station) else joints)

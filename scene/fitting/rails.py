@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter1d, grey_opening, median_filter
 from scene.geometry import find_runs
 
 _WINDOWS = (2.0, 6.0)  # m along: so long that a bin of one holds some points
-_POINTS, _ENOUGH = 8, 4  # of a bin that are wanted, and with which rails are still told
+_POINTS, _ENOUGH = 8, 4  # of a bin that are needed, and with which rails are still reported
 _LEAST = 100  # points
 _BIN = 0.02  # m across
 _LOW = (-0.10, 0.80)  # above the floor, m

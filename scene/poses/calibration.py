@@ -77,7 +77,7 @@ PRESETS = {
 }
 # `/ouster/imu` is in no preset: Ouster states where the IMU is against the sensor's frame, but its driver publishes
 # clouds in that frame (`os_sensor`) or in the LiDAR's (`os_lidar`), half a turn apart, by a setting nobody recorded.
-# What is known of an IMU without being told: Livox's sits in the housing.
+# What is known of an IMU by itself: Livox's sits in the housing.
 UNCALIBRATED = Calibration("none: the control is taken for the LiDAR's own origin", np.zeros(3), {"/livox/imu": _AVIA})
 
 

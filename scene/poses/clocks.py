@@ -22,7 +22,7 @@ from scene.reading.recording import Recording
 from scene.reading.times import Scan
 
 NOTICED = 0.010  # s; a smaller offset is within what turn rates tell
-_SWEEPS, _FEWEST = 100, 40  # that are matched one to the next; with fewer nothing is told
+_SWEEPS, _FEWEST = 100, 40  # that are matched one to the next; with fewer nothing is reported
 _PASSES = 3  # times that they are matched: each unwinds sweeps by the motion that the last one found
 _POINTS = 6_000  # of a sweep
 _WARM_UP = 8  # sweeps that are left out: the map is too thin for them
@@ -175,7 +175,7 @@ def settle(recording: Recording, other: Timed, auto: bool) -> tuple[Clock, Timed
 def _lag(recording: Recording, other: Turns) -> tuple[float | None, float]:
     """Return the lag of another clock, s, `None` where the turns do not tell, and their correlation.
 
-    Where nothing told whether a header is of the start or the end of its sweep, and the other clock is early by the
+    Where nothing reported whether a header is of the start or the end of its sweep, and the other clock is early by the
     length of a sweep, the headers are of the end.
     """
     lidar, times = lidar_turns(recording), recording.convention

@@ -13,7 +13,7 @@ from scene.reading.formats import Format, ReadingConfig, detect
 from scene.reading.source import CloudSource, Frame, choose_frame, needs_local_points, refuse_damage
 from scene.reading.tables import told_columns
 
-_COARSE, _HOPELESS = 0.02, 0.25  # m: coordinates rounded so far are told, and refused
+_COARSE, _HOPELESS = 0.02, 0.25  # m: coordinates rounded so far are reported, and refused
 _REPEATED = 10  # points for each value of a coordinate: on a grid they repeat
 _MOST_OUTSIDE = 0.5  # share of the points that may lie too far from the first to be thinned
 

@@ -156,9 +156,9 @@ class Recording:
 
     def pick(self, numbers: Iterable[int]) -> Iterator[tuple[int, Scan]]:
         """Yields some of the scans with their numbers; the others are not decoded."""
-        wanted = sorted(set(numbers))
-        messages = self._source.scans(only=frozenset(one for number in wanted for one in self._groups[number]))
-        for number in wanted:
+        needed = sorted(set(numbers))
+        messages = self._source.scans(only=frozenset(one for number in needed for one in self._groups[number]))
+        for number in needed:
             yield number, join_scans([self.convention.apply(next(messages))[0] for _ in self._groups[number]])
 
     def _timed(self, convention: Convention, raw: RawScan) -> Scan:

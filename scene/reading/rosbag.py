@@ -194,9 +194,9 @@ class _Chain:
 
     def messages(self, connections: Iterable[Any]) -> Iterator[tuple[Any, int, bytes]]:
         """Yields the messages of some connections, bag by bag."""
-        wanted = {id(connection) for connection in connections}
+        needed = {id(connection) for connection in connections}
         for reader, held in zip(self._readers, self._connections, strict=True):
-            own = [connection for connection in held if id(connection) in wanted]
+            own = [connection for connection in held if id(connection) in needed]
             if own:
                 yield from reader.messages(connections=own)
 

@@ -157,10 +157,10 @@ def cloud_records(message: Any) -> Shaped[np.ndarray, " n"]:
 def _record_layout(message: Any, step: int) -> np.dtype:
     order = ">" if message.is_bigendian else "<"
     names = [field.name for field in message.fields]
-    wanted = {time_field(names)[0], *(name for name in names if name.lower() in ("x", "y", "z"))}
+    needed = {time_field(names)[0], *(name for name in names if name.lower() in ("x", "y", "z"))}
     fields: dict[str, tuple[str, int]] = {}
     for field in message.fields:
-        if field.name in wanted and field.name not in fields:
+        if field.name in needed and field.name not in fields:
             if field.datatype not in _FIELD_TYPES:
                 raise ValueError(f"a PointCloud2 whose field {field.name} is of unknown type {field.datatype}")
             fields[field.name] = (order + _FIELD_TYPES[field.datatype], field.offset)

@@ -51,7 +51,7 @@ class CloudSource:
     format: str  # With its version, for the manifest
     # Starts reading: x, y, z as stored, `(n, 3)` float64 each, of bounded size
     chunks: Callable[[], Iterator[Float[np.ndarray, "n 3"]]]
-    # Points from all over the file, or corners of its box, by which a unit can be told
+    # Points from all over the file, or corners of its box, by which a unit can be reported
     sample: Float[np.ndarray, "k 3"]
     unit: str | None = None  # `m`, `mm` or a kind of foot, where the format or a header says so
     count: int | None = None  # Points in all, where the file knows
@@ -190,7 +190,7 @@ class Frame:
 
 
 def needs_local_points(source: CloudSource) -> bool:
-    """Return whether points that lie close together must be read before the unit of a cloud can be told."""
+    """Return whether points that lie close together must be read before the unit of a cloud can be reported."""
     if source.unit not in (None, "m"):
         return False
     finite = source.sample[np.isfinite(source.sample).all(axis=1)]
@@ -237,8 +237,8 @@ def choose_frame(
     """Return the frame of a cloud; flags (`unit`, `axes`) come before declarations, declarations before detection.
 
     `sample` holds points from all over the cloud, as stored; few or none where the file declares the unit. `local`
-    holds points that lie close together, by which cm are told from mm; a declaration of metres that would make a
-    tunnel over 500 m high and wide is not believed. Raises `ValueError` for a flag that is no unit or no order of axes,
+    holds points that lie close together, which tell cm from mm; a declaration of metres that would make a tunnel
+    over 500 m high and wide is not believed. Raises `ValueError` for a flag that is no unit or no order of axes,
     and where the file declares another unit.
     """
     if unit is not None and unit not in UNITS:

@@ -68,9 +68,9 @@ def told_columns(path: Path, text: str | None) -> dict[str, str] | None:
 
 def find_column(names: Sequence[str], told: str) -> int | None:
     """Return the index of a column that a user names by its header or its number from 1; `None` without one."""
-    wanted = plain_name(told)[0]
+    needed = plain_name(told)[0]
     for index, name in enumerate(names):
-        if name.strip() == told or plain_name(name)[0] == wanted:
+        if name.strip() == told or plain_name(name)[0] == needed:
             return index
     return int(told) - 1 if told.isdigit() and 0 < int(told) <= len(names) else None
 
@@ -96,7 +96,7 @@ def find_xyz(names: Sequence[str], told: dict[str, str] | None = None) -> tuple[
     return at, next(iter(units), None)
 
 
-_HEAD_BYTES = 1 << 16  # of a file by which its layout is told
+_HEAD_BYTES = 1 << 16  # of a file by which its layout is reported
 _PROBES = 16  # places of a file that are looked at
 _DECIMALS = re.compile(r"\s*(?:-?\d+,\d+\s+)+-?\d+(?:,\d+)?\s*")  # numbers apart by blanks, with commas in them
 _DELIMITERS = ((";", "semicolon"), ("\t", "tab"), (",", "comma"))

@@ -74,7 +74,7 @@ FADING = 0.5  # standard deviation of the logarithm of the echo (speckle)
 REFLECTIVITY_NOISE = 0.05  # of a reported reflectivity
 STEEPEST = 10.0  # tangent of the incidence angle beyond which the noise grows no more
 EDGE_STEP = 0.03  # m between two surfaces from which on they make an edge
-PULSE = 0.75  # m: echoes further apart in range are told apart by the receiver; half a pulse of 5 ns
+PULSE = 0.75  # m: echoes further apart in range are distinguished by the receiver; half a pulse of 5 ns
 
 # Diffuse reflectivity at 905 nm by `Part`; engineering judgement, meant to tell materials apart.
 ALBEDO = np.zeros(len(Part))

@@ -19,7 +19,7 @@ from subterra_jax.tasks import make
 from subterra_jax.tunnel_env import TunnelEnv
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=["tunnel", "horizon", "parts"], meta_fields=["errand"])
+@partial(jax.tree_util.register_dataclass, data_fields=["tunnel", "horizon", "parts"], meta_fields=["goal_kind"])
 @dataclasses.dataclass(frozen=True)
 class GymnaxParams(EnvParams):
     """Params of a task that answer to Gymnax's own name for the horizon too."""
@@ -55,7 +55,7 @@ class SubterraGymnax:
     def __init__(self, task: str = "Subterra/Traverse-v1", **options: Any):
         self.env: TunnelEnv
         self.env, params = make(task, **options)
-        self.default_params = GymnaxParams(params.tunnel, params.horizon, params.parts, params.errand)
+        self.default_params = GymnaxParams(params.tunnel, params.horizon, params.parts, params.goal_kind)
         self.name, self.num_actions = self.env.id, self.env.action_size
 
     def action_space(self, params: EnvParams | None = None) -> Any:

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from subterra_jax.baselines.agent import Agent
 from subterra_jax.episode import Driver, Episode, Taken
 from subterra_jax.lidar import bearings
-from subterra_jax.parts import Noise, PlanarLidar, Sight, Unicycle
+from subterra_jax.parts import Noise, PlanarLidar, SensingState, Unicycle
 from subterra_jax.parts.unicycle import clip_action
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel_env import TunnelEnv
@@ -75,10 +75,10 @@ class NoddingLidar(PlanarLidar):
         """One for each beam, then pitch and roll."""
         return super().normals(params) + 2
 
-    def observe(self, own: Any, sight: Sight, noise: Noise, params: EnvParams) -> dict[str, Array]:
+    def observe(self, own: Any, sensing: SensingState, noise: Noise, params: EnvParams) -> dict[str, Array]:
         """Return noisy `ranges`, m."""
         n_beams, nod = params.lidar.n_beams, self.nod
-        seen = super().observe(own, sight, Noise(noise.normal[:n_beams]), params)["ranges"]
+        seen = super().observe(own, sensing, Noise(noise.normal[:n_beams]), params)["ranges"]
         bearing = jnp.asarray(bearings(n_beams), jnp.float32)
         pitch = nod.pitch + nod.pitch_sigma * noise.normal[n_beams]
         roll = nod.roll_sigma * noise.normal[n_beams + 1]

@@ -56,7 +56,7 @@ class WalkEnv:
         ends = np.cumsum(list(sizes.values())).tolist()
         return {name: slice(end - size, end) for (name, size), end in zip(sizes.items(), ends, strict=True)}
 
-    def skips_unwanted(self, params: WalkParams) -> bool:
+    def skips_unneeded(self, params: WalkParams) -> bool:
         """Tell that every observation is made."""
         return False
 
@@ -150,9 +150,9 @@ class WalkEnv:
         return after, sum(terms.values(), jnp.zeros(())), fallen, (expired | outside) & ~fallen, info
 
     def observe(
-        self, state: WalkState, noise: WalkStepNoise | None, params: WalkParams, wanted: Bool[Array, ""] | bool = True
+        self, state: WalkState, noise: WalkStepNoise | None, params: WalkParams, needed: Bool[Array, ""] | bool = True
     ) -> Float[Array, "n_obs"]:
-        """Return the observation of a state, which holds it already; `noise` and `wanted` change nothing."""
+        """Return the observation of a state, which holds it already; `noise` and `needed` change nothing."""
         own = observation.observe_self(state)
         return jnp.concatenate([own, observation.observe_truth(state, params.track)]) if self.privileged else own
 

@@ -18,7 +18,7 @@ Action = Float[Array, "5"]
 
 @struct.dataclass
 class Observed:
-    """One observation, taken apart. An entry that the task does not observe is 0; `params.errand` tells tasks apart.
+    """One observation, taken apart. An entry that the task does not observe is 0; `params.goal_kind` tells tasks apart.
 
     Attributes:
         flat: The observation itself.
@@ -29,7 +29,7 @@ class Observed:
         goal: Station of the goal, m.
         ring_pitch: Distance between rings of the lining, m; 0 where there are none.
         flag: 1 once the goal has been reached, else 0.
-        start: Station of the start as it is told, m; None where it is `params.start.station`.
+        start: Station of the start as reported, m; None where it is `params.start.station`.
         entries: Every entry of the observation by name, those of parts from outside included.
     """
 

@@ -1,7 +1,7 @@
 """The ceiling: a Bayes filter that has the exact map, the sizes of all noise, and those of the episode's faults.
 
 A particle filter whose every particle casts the whole scan in the true walls; where the start may be anywhere, a
-histogram filter that does so in every cell. It is no agent that anybody could send in: nobody is told how late the data
+histogram filter that does so in every cell. It is no agent that anybody could send in: nobody knows how late the data
 or how slippery the rail of an episode is. Nothing else of the truth is read.
 """
 
@@ -31,7 +31,7 @@ def ceiling(params: EnvParams, n_particles: int | None = None) -> Navigator:
     Args:
         n_particles: Number of particles; None is 512, twice that on wet rail, and twice that with a hidden start.
     """
-    if params.errand == "report":
+    if params.goal_kind == "report":
         # It drives as far as it may: a place that seems sure early may be one of many that look alike.
         everywhere: Localiser = HistogramLocaliser.of(params)
         return Navigator(everywhere, CentreLine(), name=NAME, uses_map=True, sure_for=float("inf"))
@@ -46,10 +46,10 @@ def ceiling(params: EnvParams, n_particles: int | None = None) -> Navigator:
 
 
 def is_hidden(params: EnvParams) -> bool:
-    """Tells whether the start that a robot is told is off: then its rings may fit those of other places as well.
+    """Tells whether the start that a robot is given is off: then its rings may fit those of other places as well.
 
     There a likelihood taken whole settles on one ring by chance: with universal rings it was lost in a quarter of the
-    episodes, where one that spares its particles is lost in one of sixteen. With a start told exactly, one that is
+    episodes, where one that spares its particles is lost in one of sixteen. With a start reported exactly, one that is
     flattened to spare them would throw away what the walls tell.
     """
     return float(np.max(np.asarray(params.start.station_sigma))) > 0.0

@@ -57,7 +57,7 @@ class FusedCount(Localiser):
         corrected = _correct(belief, row, read, jnp.maximum(noise, 1e-10))
         belief = _where(step > _LEAST_STEP, corrected, belief)
         belief = _advance_errors(belief, step, params)
-        if params.errand == "return":
+        if params.goal_kind == "return":
             at = obs.goal - driven.direction * params.goal.flag_reach
             fix = _correct(belief, jnp.eye(5)[_S], at - belief.mean[_S], jnp.asarray(_FLAG_SIGMA**2))
             belief = _where(driven.flagged, fix, belief)

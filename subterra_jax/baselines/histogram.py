@@ -29,7 +29,7 @@ from subterra_jax.state import EnvParams
 
 NAME = "histogram-filter"
 CELL = 0.05  # m
-WINDOW = 25.0  # m to either side of a told start: three standard deviations of dead reckoning over 320 m
+WINDOW = 25.0  # m to either side of a reported start: three standard deviations of dead reckoning over 320 m
 N_SCALES, MOST_SCALE = 17, 0.04  # rows of the error of dead reckoning, from minus to plus the second
 CLUSTER = 0.8  # of the tolerance: half the length of what counts as one place
 _FLOOR = -80.0  # log of the least mass of a cell: what was ruled out once may come back
@@ -99,7 +99,7 @@ class HistogramLocaliser(Localiser):
     @classmethod
     def of(cls, params: EnvParams, exact: ExactParams | None = None, cell: float = CELL) -> "HistogramLocaliser":
         """Makes a localiser for the map of a task, which may be a stack, and for its nominal errors; on the host."""
-        span = float(np.max(np.asarray(params.tunnel.length))) if params.errand == "report" else 2.0 * WINDOW
+        span = float(np.max(np.asarray(params.tunnel.length))) if params.goal_kind == "report" else 2.0 * WINDOW
         return cls(
             walls=wall_map(params.tunnel),
             noise=cloud_params(params),
@@ -111,8 +111,8 @@ class HistogramLocaliser(Localiser):
         )
 
     def begin(self, obs: Observed, params: EnvParams) -> HistogramMemory:
-        """Returns a belief about the told start, as wide as it is uncertain; or an even one, facing either way."""
-        if params.errand == "report":
+        """Returns a belief about the start, as wide as it is uncertain; or an even one, facing either way."""
+        if params.goal_kind == "report":
             origin, margin = jnp.zeros(()), jnp.asarray(params.goal.margin)
             tape = self._tape(origin)
             inside = (tape >= margin) & (tape <= params.tunnel.length - margin)

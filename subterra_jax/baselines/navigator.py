@@ -55,12 +55,12 @@ def target_speed(mission: Mission, estimate: Station, obs: Observed, params: Env
         estimate: Estimate of the station.
     """
     speed_max = jnp.asarray(params.vehicle.speed_max)
-    if params.errand == "cover":
+    if params.goal_kind == "cover":
         return speed_max
-    if params.errand == "report":
+    if params.goal_kind == "report":
         return jnp.where(mission.stopped, 0.0, speed_max)
     target = obs.goal
-    if params.errand == "return":
+    if params.goal_kind == "return":
         home = told_start(obs, params)
         # Out until the flag is raised, wherever the goal is believed to be.
         target = jnp.where(mission.direction > 0.0, _FAR, home)
@@ -70,7 +70,7 @@ def target_speed(mission: Mission, estimate: Station, obs: Observed, params: Env
 
 def check_arrival(mission: Mission, target: Float[Array, ""], driven: Float[Array, ""], params: EnvParams) -> Mission:
     """Returns the mission after a command: the target speed of the last period, driven in full, is the arrival."""
-    if params.errand in ("cover", "report"):
+    if params.goal_kind in ("cover", "report"):
         return mission
     there = (target < params.vehicle.speed_max) & (driven >= target) & ~is_turning(mission)
     return dataclasses.replace(mission, stopped=mission.stopped | there)
@@ -101,7 +101,7 @@ def watch(mission: Mission, obs: Observed, params: EnvParams) -> tuple[Mission, 
     Returns:
         The mission, true where the flag has just been raised, and true where the turn has just ended.
     """
-    if params.errand != "return":
+    if params.goal_kind != "return":
         no = jnp.zeros((), bool)
         return mission, no, no
     raised = (obs.flag > 0.5) & ~mission.flagged
@@ -140,7 +140,7 @@ class Memory:
 class Navigator:
     """An agent that localises itself, decides how far to go, and steers there.
 
-    Asked to report where it is, it drives until its map has told it; without a map it reports at once.
+    Asked to report where it is, it drives until its map has shown it; without a map it reports at once.
     """
 
     localiser: Localiser  # estimates the station
@@ -179,11 +179,11 @@ class Navigator:
         mirrored = self.steering.turn_round(steering)
         steering = jax.tree.map(lambda new, old: jnp.where(done, new, old), mirrored, steering)
         estimate, localiser = self.localiser.update(memory.localiser, obs, driven, params, known)
-        if params.errand == "report":
+        if params.goal_kind == "report":
             sure_for = self.sure_for if self.uses_map else 0.0
             now = search(now, estimate, moved, obs, params, sure_for)
         target = target_speed(now, estimate, obs, params)
-        paced = target if params.errand == "cover" else jnp.minimum(target, self.cruise)
+        paced = target if params.goal_kind == "cover" else jnp.minimum(target, self.cruise)
         command = self.steering.steer(steering, paced, params)
         command = jnp.where(is_turning(now), turn_command(now, params), command)
         limit = jnp.stack([jnp.asarray(params.vehicle.speed_max), jnp.asarray(params.vehicle.yaw_rate_max)])

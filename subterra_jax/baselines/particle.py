@@ -79,9 +79,9 @@ class ParticleLocaliser(Localiser):
         )
 
     def begin(self, obs: Observed, params: EnvParams) -> FilterMemory:
-        """Spreads particles about the told start as far as it is uncertain; without one evenly, facing either way."""
+        """Spreads particles about the start as far as it is uncertain; without one evenly, facing either way."""
         n, cloud_key = self.n_particles, jax.random.key(self.seed)
-        if params.errand == "report":
+        if params.goal_kind == "report":
             room, share = params.tunnel.length - 2.0 * params.goal.margin, (jnp.arange(n) + 0.5) / n
             station, heading = params.goal.margin + room * share, jnp.where(jnp.arange(n) % 2 == 0, 0.0, jnp.pi)
         else:
@@ -137,7 +137,7 @@ def particle_filter(params: EnvParams, n_particles: int | None = None) -> Naviga
     if n_particles is None:
         uncertain = float(np.max(np.asarray(params.start.station_sigma))) > 0.0
         n_particles = 1024 if uncertain else 512 if "faults" in params.parts else 256
-        if params.errand == "report":
+        if params.goal_kind == "report":
             n_particles = 4096
     localiser = ParticleLocaliser.of(params, n_particles)
     return Navigator(localiser, steering_of(params, CentreLine()), name="particle-filter", uses_map=True)

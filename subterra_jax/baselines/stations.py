@@ -47,13 +47,13 @@ def odometry_sigma(distance: Float[Array, ""], steps: Float[Array, ""], params: 
 
 
 def told_start(obs: Observed, params: EnvParams) -> Float[Array, ""]:
-    """Return the station of the start as it is told, m."""
+    """Return the station of the start as reported, m."""
     return jnp.asarray(params.start.station if obs.start is None else obs.start, jnp.float32)
 
 
 def believed_start(obs: Observed, params: EnvParams) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Return the believed station of the start and its standard deviation, m; anywhere, where that is the task."""
-    if params.errand == "report":
+    if params.goal_kind == "report":
         room = params.tunnel.length - 2.0 * params.goal.margin
         return 0.5 * params.tunnel.length, room / jnp.sqrt(12.0)
     return told_start(obs, params), jnp.asarray(params.start.station_sigma, jnp.float32)

@@ -1,8 +1,8 @@
 """The floor of a task: the most that anybody can expect who never localises by the walls.
 
-Such an agent has commands, odometry, the flag and what it is told, and knows the sizes of every error and, under
-faults, the episode's severity; no start and no goal lies in sight of a mouth. float64 on the host, sharing no code with
-the simulator or the agents: who stands above it has looked at the walls, or has been told.
+Such an agent has commands, odometry, the flag and what it is given, and knows the sizes of every error and, under
+faults, the episode's severity; no start and no goal lies in view of a mouth. float64 on the host, sharing no code with
+the simulator or the agents: who stands above it has looked at the walls, or has been reported.
 """
 
 import math
@@ -28,14 +28,14 @@ def floor(params: EnvParams, index: int = 0) -> float:
     """
     length = float(np.broadcast_to(np.asarray(params.tunnel.length), params.tunnel.count)[index])
     tolerance, room = float(params.goal.tolerance), length - 2.0 * float(params.goal.margin)
-    if params.errand == "report":
+    if params.goal_kind == "report":
         # Anywhere in the room, and either way.
         return 0.5 * min(1.0, 2.0 * tolerance / max(room, 2.0 * tolerance))
     high = min(float(params.goal.high), room)
     low = min(float(params.goal.low), high)
     distance = low + (high - low) * (np.arange(_GOALS) + 0.5) / _GOALS
     start = float(params.start.station_sigma) ** 2
-    if params.errand == "return":
+    if params.goal_kind == "return":
         return within(tolerance, np.sqrt(way_back_variance(distance, params)))
     variance = way_out_variance(distance, params)
     if "faults" in params.parts:

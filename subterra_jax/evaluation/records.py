@@ -93,7 +93,7 @@ def make_records(tally: Any, episodes: Episodes, env: TunnelEnv, params: EnvPara
     steps, period = np.maximum(tally.steps, 1), float(np.max(params.vehicle.period))
     travelled, found = tally.travelled.astype(float), tally.estimates
     per_metre = _over(np.ones(len(episodes)), travelled)
-    covers = env.rule.errand == "cover"
+    covers = env.rule.goal_kind == "cover"
     error = found.error.astype(float)
     estimated = ~np.isnan(found.square)
     locked = estimated & (found.unlocked < tally.steps)

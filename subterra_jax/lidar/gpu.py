@@ -35,7 +35,7 @@ def scan(
     position: Float[Array, "n 2"],
     heading: Float[Array, " n"],
     start: Int[Array, " n"],
-    wanted: Bool[Array, " n"],
+    needed: Bool[Array, " n"],
     range_max: Float[Array, ""],
     bearing: np.ndarray,
 ) -> Float[Array, "n n_beams"]:
@@ -46,7 +46,7 @@ def scan(
         position: Positions of the LiDAR, tunnel frame, m.
         heading: Its headings, rad.
         start: First block that each scan visits.
-        wanted: Which scans to take; the others cost next to nothing, and hold anything.
+        needed: Which scans to take; the others cost next to nothing, and hold anything.
         range_max: Largest range, m.
         bearing: Of each beam from the heading, rad.
 
@@ -54,7 +54,7 @@ def scan(
         As `lidar.scan`.
     """
     n_beams, n_rows = len(bearing), _rows()
-    count, rows = _pad_rows(n_rows, start, wanted.astype(jnp.int32), *position.T, heading)
+    count, rows = _pad_rows(n_rows, start, needed.astype(jnp.int32), *position.T, heading)
     n, n_some = len(rows[0]), max(k for k in range(1, BEAMS + 1) if n_beams % k == 0)
     turn = jnp.asarray(np.concatenate([np.cos(bearing), np.sin(bearing)]), jnp.float32)
     ranges = _call(
@@ -163,7 +163,7 @@ class _Beam(NamedTuple):
 
 
 def _scan_kernel(
-    start_ref, wanted_ref, x_ref, y_ref, heading_ref, turn_ref, limit_ref, block_ref, wall_ref, range_ref, *,
+    start_ref, needed_ref, x_ref, y_ref, heading_ref, turn_ref, limit_ref, block_ref, wall_ref, range_ref, *,
     n_beams: int, n_some: int, n_rows: int,
 ) -> None:  # fmt: skip
     """Cast some beams of each of many robots, each thread those of one robot in its own time."""
@@ -172,8 +172,8 @@ def _scan_kernel(
 
     row = pl.program_id(1) * n_rows + lax.broadcasted_iota(jnp.int32, (n_rows,), 0)
     first_beam = pl.program_id(0) * n_some
-    start, wanted, x, y, heading = (
-        triton.load(ref.at[row]) for ref in (start_ref, wanted_ref, x_ref, y_ref, heading_ref)
+    start, needed, x, y, heading = (
+        triton.load(ref.at[row]) for ref in (start_ref, needed_ref, x_ref, y_ref, heading_ref)
     )
     cos, sin, limit = jnp.cos(heading), jnp.sin(heading), jnp.full((n_rows,), triton.load(limit_ref.at[jnp.int32(0)]))
 
@@ -214,7 +214,7 @@ def _scan_kernel(
             jnp.where(begins, limit, visit.best),
         )
 
-    begin = _Visit(start, jnp.ones_like(x), jnp.where(wanted > 0, _VISITS, _IDLE), limit)
+    begin = _Visit(start, jnp.ones_like(x), jnp.where(needed > 0, _VISITS, _IDLE), limit)
     beam = aim(jnp.full((n_rows,), first_beam, jnp.int32))
     lax.while_loop(lambda carry: _count(carry[1].state, _IDLE) < n_rows, one_round, (beam, begin))
 

@@ -44,7 +44,7 @@ def scan(
     heading: Float[Array, ""],
     station: Float[Array, ""],
     params: LidarParams,
-    wanted: Bool[Array, ""] | bool = True,
+    needed: Bool[Array, ""] | bool = True,
 ) -> Float[Array, "n_beams"]:
     """True ranges of one scan: beam 0 straight ahead, the others counter-clockwise, evenly spaced over the whole turn.
 
@@ -52,7 +52,7 @@ def scan(
         position: Position of the LiDAR, tunnel frame, m.
         heading: Its heading, rad.
         station: Its station, m; chooses the window of walls.
-        wanted: Someone will read the scan; where not, the ranges may be anything.
+        needed: Someone will read the scan; where not, the ranges may be anything.
 
     Returns:
         Ranges without noise, m, in [0, range_max]; exactly `range_max` where a beam meets no wall within it, as when it
@@ -63,11 +63,11 @@ def scan(
     beams = dataclasses.replace(params, range_max=tunnel.reach, range_sigma=0.0)
     # The kernels know 32 bits.
     by_kernels = params.fused and kernels.present() and position.dtype == jnp.float32 and tunnel.packed is not None
-    ranges = _true_ranges(by_kernels, (tunnel.walls, beams), position, heading, node, jnp.asarray(wanted))
+    ranges = _true_ranges(by_kernels, (tunnel.walls, beams), position, heading, node, jnp.asarray(needed))
     return jnp.minimum(ranges, params.range_max)
 
 
-def skips_unwanted(params: LidarParams) -> bool:
+def skips_unneeded(params: LidarParams) -> bool:
     """Tell whether the fused kernels cast a batch of scans; they cost little for scans that nobody wants."""
     return params.fused and nvidia.present()
 
@@ -77,10 +77,10 @@ def _cast(
     position: Float[Array, "2"],
     heading: Float[Array, ""],
     node: Int[Array, ""],
-    wanted: Bool[Array, ""],
+    needed: Bool[Array, ""],
 ) -> Float[Array, "n_beams"]:
-    """`scan` from a known node, by XLA, wanted or not."""
-    del wanted
+    """`scan` from a known node, by XLA, needed or not."""
+    del needed
     tunnel, params = what
     direction = beam_directions(heading, params.n_beams)
     return jnp.minimum(cast.nearest(tunnel, tunnel.scan_first[node], position, direction), params.range_max)
@@ -90,12 +90,12 @@ def _by(kernel: Callable[..., Array]) -> Callable[..., Array]:
     """A kernel for many scans in one tunnel, with the arguments of `_cast`."""
 
     def cast_rows(
-        what: tuple[Tunnel, LidarParams], position: Array, heading: Array, node: Array, wanted: Array
+        what: tuple[Tunnel, LidarParams], position: Array, heading: Array, node: Array, needed: Array
     ) -> Array:
         tunnel, params = what
         limit = jnp.asarray(params.range_max)
         start = tunnel.visit_first[node]
-        ranges = kernel(tunnel, position, heading, start, wanted, limit, bearings(params.n_beams))
+        ranges = kernel(tunnel, position, heading, start, needed, limit, bearings(params.n_beams))
         return vary_like(ranges, position, heading, node)
 
     return cast_rows
@@ -115,11 +115,11 @@ def _true_ranges(
     position: Float[Array, "2"],
     heading: Float[Array, ""],
     node: Int[Array, ""],
-    wanted: Bool[Array, ""],
+    needed: Bool[Array, ""],
 ) -> Float[Array, "n_beams"]:
     """`scan` from a known node, differentiable by the pose and by the walls."""
     take: Callable[..., Array] = _cast_by_kernels if by_kernels else _cast
-    return take(what, position, heading, node, wanted)
+    return take(what, position, heading, node, needed)
 
 
 def _range_slopes(by_kernels: bool, primals: Any, tangents: Any) -> tuple[Array, Array]:

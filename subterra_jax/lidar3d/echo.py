@@ -10,7 +10,7 @@ from subterra_jax import constants as c
 STEEPEST = 10.0  # tangent of the incidence angle beyond which the noise grows no more
 FADING = 0.5  # standard deviation of the logarithm of an echo (speckle)
 EDGE_STEP = 0.03  # m between two surfaces from which on they make an edge
-PULSE = 0.75  # m: echoes further apart in range are told apart by the receiver; half a pulse of 5 ns
+PULSE = 0.75  # m: echoes further apart in range are distinguished by the receiver; half a pulse of 5 ns
 LEVEL = 0.8  # least upward part of a floor's normal
 # Diffuse reflectivity near 905 nm: concrete lining, floor, things of the track and furniture. Engineering judgement.
 ALBEDO_LINING, ALBEDO_FLOOR, ALBEDO_THING = 0.30, 0.20, 0.36

@@ -76,7 +76,7 @@ def scan(
     position: Float[Array, "n 2"],
     heading: Float[Array, " n"],
     start: Int[Array, " n"],
-    wanted: Bool[Array, " n"],
+    needed: Bool[Array, " n"],
     range_max: Float[Array, ""],
     bearing: np.ndarray,
 ) -> Float[Array, "n n_beams"]:
@@ -84,7 +84,7 @@ def scan(
     shape = jax.ShapeDtypeStruct((position.shape[0], len(bearing)), jnp.float32)
     turn = np.concatenate([np.cos(bearing), np.sin(bearing)]).astype(np.float32)
     limit = jnp.asarray(range_max, jnp.float32).reshape(1)
-    rows = start, wanted.astype(jnp.int32), position, heading
+    rows = start, needed.astype(jnp.int32), position, heading
     return _call("subterra_scan", scan_rows, 64, shape, *rows, tunnel.box, tunnel.wall, turn, limit)
 
 

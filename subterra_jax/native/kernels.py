@@ -84,8 +84,8 @@ def _look(box, n, wall, n_vertices, low, x, y, d_x, d_y, ahead, behind, enters, 
 @compiled
 @no_type_check
 def scan_rows(results, operands, begin, end):
-    """Take the scans `begin` to `end` of a call: start, wanted, position, heading, box, wall, turn, limit to ranges."""
-    start, wanted = argument(operands, 0).view(_I), argument(operands, 1).view(_I)
+    """Take the scans `begin` to `end` of a call: start, needed, position, heading, box, wall, turn, limit to ranges."""
+    start, needed = argument(operands, 0).view(_I), argument(operands, 1).view(_I)
     position, heading, box, wall = (
         argument(operands, 2),
         argument(operands, 3),
@@ -100,7 +100,7 @@ def scan_rows(results, operands, begin, end):
     enters, work = np.empty(GROUP, np.int32), np.empty(WIDTH, np.float32)
     bits = work.view(np.int32)
     for row in range(_U(begin), _U(end)):
-        if wanted[row] == 0:
+        if needed[row] == 0:
             continue
         cos, sin = _F(math.cos(heading[row])), _F(math.sin(heading[row]))
         x, y, middle = position[_U(2) * row], position[_U(2) * row + _U(1)], _U(start[row]) - _HALF

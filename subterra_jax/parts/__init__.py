@@ -4,7 +4,7 @@ from subterra_jax.parts.faults import FaultParams, Faults
 from subterra_jax.parts.imu import Imu, ImuParams
 from subterra_jax.parts.obstacles import Obstacles
 from subterra_jax.parts.odometer import Odometer
-from subterra_jax.parts.part import Drive, Motion, Moved, Noise, Part, Sight, Step
+from subterra_jax.parts.part import Drive, Motion, Moved, Noise, Part, SensingState, Step
 from subterra_jax.parts.planar_lidar import PlanarLidar
 from subterra_jax.parts.slip import Slip
 from subterra_jax.parts.spatial_lidar import SpatialLidar, SpatialParams, make_sensor
@@ -23,7 +23,7 @@ __all__ = [
     "Odometer",
     "Part",
     "PlanarLidar",
-    "Sight",
+    "SensingState",
     "Slip",
     "SpatialLidar",
     "SpatialParams",

@@ -1,6 +1,6 @@
 """Faults that come and go: beams that drop out, dust, an odometer that freezes, stale data, wet rails.
 
-Their sizes are drawn for each episode and never told, and no exact zero gives them away.
+Their sizes are drawn for each episode and never reported, and no exact zero gives them away.
 """
 
 import dataclasses
@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, UInt32
 from subterra_jax import constants
 from subterra_jax.parts.hashing import uniform
 from subterra_jax.parts.odometer import OdometryState
-from subterra_jax.parts.part import Batch, Drive, Keys, Noise, Part, Sight, Step
+from subterra_jax.parts.part import Batch, Drive, Keys, Noise, Part, SensingState, Step
 from subterra_jax.parts.unicycle import wrap
 from subterra_jax.state import EnvParams, State
 
@@ -82,7 +82,7 @@ class FaultState:
     origin: Float[Array, "2"]  # readings of the odometer at the start, m and rad
 
 
-def sight(
+def sensing(
     position: Float[Array, "2"], heading: Float[Array, ""], station: Float[Array, ""], reading: OdometryState
 ) -> Float[Array, "6"]:
     """Make a row of `FaultState.seen`."""
@@ -140,7 +140,7 @@ def observed(state: FaultState, params: FaultParams) -> Float[Array, "6"]:
     return state.seen[delay]
 
 
-def spoil(
+def corrupt(
     ranges: Float[Array, "n_beams"],
     state: FaultState,
     draw: Float[Array, "k"],
@@ -207,7 +207,7 @@ class Faults(Part):
         noise = jnp.stack([jnp.asarray(odometry.distance_sigma), jnp.asarray(odometry.heading_sigma)])
         past = noise[None, :] * jnp.cumsum(draw[3][:-1], axis=0)
         origin = jnp.stack([jnp.asarray(faults.origin_distance), jnp.asarray(faults.origin_heading)]) * draw[3][-1]
-        now = sight(state.position, state.heading, state.station, state.odometry)
+        now = sensing(state.position, state.heading, state.station, state.odometry)
         zero = jnp.zeros_like(draw[1])
         return FaultState(
             severity=draw_severity(draw[1], faults),
@@ -234,20 +234,20 @@ class Faults(Part):
         return Drive(jnp.where(frozen(own), 0.0, drive.wheels), motion)
 
     def advance(self, own: FaultState, step: Step, noise: Noise, params: EnvParams) -> FaultState:
-        seen = sight(step.position, step.heading, step.place.station, step.after["odometry"])
+        seen = sensing(step.position, step.heading, step.place.station, step.after["odometry"])
         return advance_faults(own, seen, noise.uniform, params.lidar.n_beams, self.sizes(own, params))
 
-    def look_from(self, own: FaultState, sight: Sight, params: EnvParams) -> Sight:
+    def look_from(self, own: FaultState, sensing: SensingState, params: EnvParams) -> SensingState:
         """Show an earlier moment, by an odometer that did not begin at 0."""
         seen = observed(own, self.sizes(own, params))
         reading = dataclasses.replace(
-            sight.parts["odometry"], distance=seen[4] + own.origin[0], heading=wrap(seen[5] + own.origin[1])
+            sensing.parts["odometry"], distance=seen[4] + own.origin[0], heading=wrap(seen[5] + own.origin[1])
         )
-        parts = {**sight.parts, "odometry": reading}
-        return dataclasses.replace(sight, position=seen[:2], heading=seen[2], station=seen[3], parts=parts)
+        parts = {**sensing.parts, "odometry": reading}
+        return dataclasses.replace(sensing, position=seen[:2], heading=seen[2], station=seen[3], parts=parts)
 
-    def spoil(self, own: FaultState, ranges: Array, noise: Noise, params: EnvParams) -> Array:
-        return spoil(ranges, own, noise.uniform, jnp.asarray(params.lidar.range_max), self.sizes(own, params))
+    def corrupt(self, own: FaultState, ranges: Array, noise: Noise, params: EnvParams) -> Array:
+        return corrupt(ranges, own, noise.uniform, jnp.asarray(params.lidar.range_max), self.sizes(own, params))
 
     def privileged(self, own: FaultState) -> dict[str, Array]:
         """Return the severity, and the factors on the middles of the sizes that a bound may know."""

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from subterra_jax import constants as c
 from subterra_jax.lidar3d.space import ground_at, level_axes
-from subterra_jax.parts.part import Batch, Bounds, Keys, Noise, Part, Sight, Step
+from subterra_jax.parts.part import Batch, Bounds, Keys, Noise, Part, SensingState, Step
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel import at_station
 
@@ -124,9 +124,9 @@ class Imu(Part):
         white = _sizes(sensor.accel_density, sensor.gyro_density) * jnp.sqrt(1.0 / interval) * drawn[:-1]
         return ImuState(true + bias + white, velocity[-1], axes[-1], bias)
 
-    def observe(self, own: ImuState, sight: Sight, noise: Noise, params: EnvParams) -> dict[str, Array]:
+    def observe(self, own: ImuState, sensing: SensingState, noise: Noise, params: EnvParams) -> dict[str, Array]:
         """Return `imu`: the samples of the last step, one after another."""
-        return {"imu": sight.parts[self.name].samples.reshape(-1)}
+        return {"imu": sensing.parts[self.name].samples.reshape(-1)}
 
     def space(self, params: EnvParams) -> dict[str, Bounds]:
         n = 6 * params.imu.samples

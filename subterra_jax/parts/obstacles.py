@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int, UInt32
 from subterra_jax import constants
 from subterra_jax.parts.boxes import Boxes, distance_along, distance_to
 from subterra_jax.parts.hashing import uniform
-from subterra_jax.parts.part import Batch, Keys, Part, Sight
+from subterra_jax.parts.part import Batch, Keys, Part, SensingState
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel import Tunnel, at_station
 
@@ -126,10 +126,10 @@ class Obstacles(Part):
         return clearance(own.seed, station, position, tunnel, _ahead(own, params))
 
     def hits(
-        self, own: ObstacleState, sight: Sight, directions: Float[Array, "n_beams 2"], params: EnvParams
+        self, own: ObstacleState, sensing: SensingState, directions: Float[Array, "n_beams 2"], params: EnvParams
     ) -> Float[Array, "n_beams"]:
-        boxes = boxes_near(own.seed, sight.station, REACH, N_SLOTS, sight.tunnel, _ahead(own, params))
-        return distance_along(boxes, sight.position, directions)
+        boxes = boxes_near(own.seed, sensing.station, REACH, N_SLOTS, sensing.tunnel, _ahead(own, params))
+        return distance_along(boxes, sensing.position, directions)
 
     def boxes(self, own: ObstacleState, station: Array, tunnel: Tunnel, params: EnvParams) -> list[Boxes]:
         return [boxes_near(own.seed, station, REACH, N_SLOTS, tunnel, _ahead(own, params))]

@@ -10,7 +10,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float
 
 from subterra_jax import constants
-from subterra_jax.parts.part import Batch, Bounds, Keys, Noise, Part, Sight, Step
+from subterra_jax.parts.part import Batch, Bounds, Keys, Noise, Part, SensingState, Step
 from subterra_jax.parts.unicycle import wrap
 from subterra_jax.parts.wander import WanderParams, advance_wander, start_wander
 from subterra_jax.state import EnvParams, State
@@ -137,8 +137,8 @@ class Odometer(Part):
         period = jnp.asarray(params.vehicle.period)
         return advance_odometry(own, step.drive.wheels, period, noise.normal, params.odometry, backward)
 
-    def observe(self, own: OdometryState, sight: Sight, noise: Noise, params: EnvParams) -> dict[str, Array]:
-        seen = sight.parts[self.name]
+    def observe(self, own: OdometryState, sensing: SensingState, noise: Noise, params: EnvParams) -> dict[str, Array]:
+        seen = sensing.parts[self.name]
         return {"odometry": jnp.stack([seen.distance, seen.heading])}
 
     def space(self, params: EnvParams) -> dict[str, Bounds]:

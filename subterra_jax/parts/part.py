@@ -2,7 +2,7 @@
 
 reset:  draw_reset ─► begin
 step:   draw_step ─► drive ─► clearance ─► advance ─► (rule) judge
-scan:   look_from ─► hits, spoil ─► observe
+scan:   look_from ─► hits, corrupt ─► observe
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ class Step:
 
 
 @dataclasses.dataclass(frozen=True)
-class Sight:
+class SensingState:
     """The moment that sensors show: the present one, or an earlier one where observations are late.
 
     Attributes:
@@ -106,9 +106,9 @@ class Sight:
         heading: Heading, rad.
         station: Station, m.
         parts: States of the parts, by name.
-        wanted: Someone will read the observation; where not, ranges may be anything.
+        needed: Someone will read the observation; where not, ranges may be anything.
         hits: From beam directions `(n_beams, 2)` to distances to obstacles, m; `inf` where there are none.
-        spoil: From true ranges to ranges with dust and lost beams, m.
+        corrupt: From true ranges to ranges with dust and lost beams, m.
     """
 
     tunnel: Tunnel
@@ -116,9 +116,9 @@ class Sight:
     heading: Float[Array, ""]
     station: Float[Array, ""]
     parts: Mapping[str, Any]
-    wanted: Any = True
+    needed: Any = True
     hits: Callable[[Array], Any] = lambda directions: np.inf
-    spoil: Callable[[Array], Array] = lambda ranges: ranges
+    corrupt: Callable[[Array], Array] = lambda ranges: ranges
 
 
 class Part(abc.ABC):
@@ -178,19 +178,19 @@ class Part(abc.ABC):
         """Return the part's state after a step."""
         return own
 
-    def look_from(self, own: Any, sight: Sight, params: EnvParams) -> Sight:
+    def look_from(self, own: Any, sensing: SensingState, params: EnvParams) -> SensingState:
         """Change the moment that sensors show, as a delay does."""
-        return sight
+        return sensing
 
-    def hits(self, own: Any, sight: Sight, directions: Float[Array, "n_beams 2"], params: EnvParams) -> Any:
+    def hits(self, own: Any, sensing: SensingState, directions: Float[Array, "n_beams 2"], params: EnvParams) -> Any:
         """Measure how far along each beam the part's obstacles are met, m; `inf` for none."""
         return np.inf
 
-    def spoil(self, own: Any, ranges: Float[Array, n_beams], noise: Noise, params: EnvParams) -> Array:
+    def corrupt(self, own: Any, ranges: Float[Array, n_beams], noise: Noise, params: EnvParams) -> Array:
         """Change true ranges, as dust does."""
         return ranges
 
-    def observe(self, own: Any, sight: Sight, noise: Noise, params: EnvParams) -> dict[str, Array]:
+    def observe(self, own: Any, sensing: SensingState, noise: Noise, params: EnvParams) -> dict[str, Array]:
         """Return the part's entries of the observation by name, each `(n,)` or a single number."""
         return {}
 
@@ -230,7 +230,7 @@ class Part(abc.ABC):
         """Return boxes near a station, for pictures."""
         return []
 
-    def skips_unwanted(self, params: EnvParams) -> bool:
+    def skips_unneeded(self, params: EnvParams) -> bool:
         """Tell whether a batch of observations costs little for those that nobody wants."""
         return False
 

@@ -10,7 +10,7 @@ from jaxtyping import Array
 from subterra_jax import lidar
 from subterra_jax.lidar3d import echo
 from subterra_jax.parts.brightness import MOST, intensity, wall_brightness
-from subterra_jax.parts.part import Bounds, Noise, Part, Sight
+from subterra_jax.parts.part import Bounds, Noise, Part, SensingState
 from subterra_jax.state import EnvParams
 
 
@@ -27,15 +27,17 @@ class PlanarLidar(Part):
     def normals(self, params: EnvParams) -> int:
         return params.lidar.n_beams * (1 + params.lidar.intensity)
 
-    def observe(self, own: Any, sight: Sight, noise: Noise, params: EnvParams) -> dict[str, Array]:
-        walls, n = self.true_ranges(own, sight, params), params.lidar.n_beams
-        directions = lidar.beam_directions(sight.heading, n)
-        things = sight.hits(directions)
-        ranges = sight.spoil(jnp.minimum(walls, things))
+    def observe(self, own: Any, sensing: SensingState, noise: Noise, params: EnvParams) -> dict[str, Array]:
+        walls, n = self.true_ranges(own, sensing, params), params.lidar.n_beams
+        directions = lidar.beam_directions(sensing.heading, n)
+        things = sensing.hits(directions)
+        ranges = sensing.corrupt(jnp.minimum(walls, things))
         entries = {"ranges": lidar.add_noise(ranges, noise.normal[:n], params.lidar)}
         if params.lidar.intensity:
-            ends = sight.position + walls[:, None] * directions
-            factor, tangent = wall_brightness(sight.tunnel, sight.station, sight.position, ends, params.lidar.texture)
+            ends = sensing.position + walls[:, None] * directions
+            factor, tangent = wall_brightness(
+                sensing.tunnel, sensing.station, sensing.position, ends, params.lidar.texture
+            )
             slant = jnp.abs(tangent[:, 0] * directions[:, 1] - tangent[:, 1] * directions[:, 0])
             met = things < walls
             reflectivity = jnp.where(met, echo.ALBEDO_THING, echo.ALBEDO_LINING * factor)
@@ -43,9 +45,11 @@ class PlanarLidar(Part):
             entries["intensity"] = jnp.where(ranges < params.lidar.range_max, shown, 0.0)
         return entries
 
-    def true_ranges(self, own: Any, sight: Sight, params: EnvParams) -> Array:
+    def true_ranges(self, own: Any, sensing: SensingState, params: EnvParams) -> Array:
         """Cast the beams against the walls, m."""
-        return lidar.scan(sight.tunnel, sight.position, sight.heading, sight.station, params.lidar, sight.wanted)
+        return lidar.scan(
+            sensing.tunnel, sensing.position, sensing.heading, sensing.station, params.lidar, sensing.needed
+        )
 
     def space(self, params: EnvParams) -> dict[str, Bounds]:
         n_beams, range_max = params.lidar.n_beams, jnp.max(jnp.asarray(params.lidar.range_max))
@@ -54,5 +58,5 @@ class PlanarLidar(Part):
             entries["intensity"] = (np.zeros(n_beams), np.full(n_beams, MOST))
         return entries
 
-    def skips_unwanted(self, params: EnvParams) -> bool:
-        return lidar.skips_unwanted(params.lidar)
+    def skips_unneeded(self, params: EnvParams) -> bool:
+        return lidar.skips_unneeded(params.lidar)

@@ -15,7 +15,7 @@ from subterra_jax.lidar3d.echo import EchoParams
 from subterra_jax.lidar3d.relief import Relief
 from subterra_jax.lidar3d.space import Mount, into_tunnel, stand
 from subterra_jax.parts.brightness import DOPPLER_MOST, DOPPLER_SIGMA, FULL_SCALE, MOST, intensity, wall_brightness
-from subterra_jax.parts.part import Bounds, Noise, Part, Sight, Step
+from subterra_jax.parts.part import Bounds, Noise, Part, SensingState, Step
 from subterra_jax.parts.unicycle import wrap
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel import at_station
@@ -214,41 +214,43 @@ class SpatialLidar(Part):
         """Keep the pose before the step."""
         return Sweeping(step.before.position, step.before.heading) if params.lidar.remembers else own
 
-    def poses(self, own: Any, sight: Sight, params: EnvParams) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
+    def poses(
+        self, own: Any, sensing: SensingState, params: EnvParams
+    ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
         """Return origin (m) and direction of each beam, tunnel frame."""
         sensor = params.lidar
         if not sensor.sweep:
-            place, axes = stand(sight.tunnel, sight.position, sight.heading, sight.station, sensor.mount)
+            place, axes = stand(sensing.tunnel, sensing.position, sensing.heading, sensing.station, sensor.mount)
             return jnp.broadcast_to(place, (sensor.n_beams, 3)), into_tunnel(axes, sensor.directions)
         share = 1.0 + sensor.times / jnp.asarray(params.vehicle.period)
-        position, heading = along_arc(own, sight.position, sight.heading, share)
-        tunnel = sight.tunnel
-        _, _, tangent_x, tangent_y, _ = at_station(tunnel, sight.station)
-        away = position - sight.position
-        station = sight.station + away[:, 0] * tangent_x + away[:, 1] * tangent_y
+        position, heading = along_arc(own, sensing.position, sensing.heading, share)
+        tunnel = sensing.tunnel
+        _, _, tangent_x, tangent_y, _ = at_station(tunnel, sensing.station)
+        away = position - sensing.position
+        station = sensing.station + away[:, 0] * tangent_x + away[:, 1] * tangent_y
         places, axes = jax.vmap(stand, (None, 0, 0, 0, None))(tunnel, position, heading, station, sensor.mount)
         turned = jax.vmap(lambda a, d: into_tunnel(a, d[None])[0])(axes, sensor.directions)
         return places, turned
 
-    def relief(self, sight: Sight, params: EnvParams) -> Relief:
-        return sight.tunnel.space.relief
+    def relief(self, sensing: SensingState, params: EnvParams) -> Relief:
+        return sensing.tunnel.space.relief
 
-    def look(self, own: Any, sight: Sight, uniform: Any, params: EnvParams) -> tuple[Met, Array, Array, Array]:
+    def look(self, own: Any, sensing: SensingState, uniform: Any, params: EnvParams) -> tuple[Met, Array, Array, Array]:
         """Return the nearest surfaces, the cosines of incidence, the rays, and their origins.
 
         Args:
             own: State of the part.
-            sight: Moment that is shown.
+            sensing: Moment that is shown.
             uniform: Numbers for the sides of the rims; read where pixels are mixed.
         """
         sensor = params.lidar
-        origins, rays = self.poses(own, sight, params)
+        origins, rays = self.poses(own, sensing, params)
         n, both = sensor.n_beams, rays
         if sensor.echo.mixing:
             both = jnp.concatenate([rays, echo.rim_of(rays, uniform[:, 2], sensor.echo)])
             origins = jnp.concatenate([origins, origins]) if sensor.sweep else origins
-        met = self._meet(origins, both, sight, params)
-        standing = sight.hits(both[:, :2])
+        met = self._meet(origins, both, sensing, params)
+        standing = sensing.hits(both[:, :2])
         nearer = standing < met.ranges
         met = met._replace(ranges=jnp.minimum(met.ranges, standing), thing=met.thing | nearer)
         normal = met.normal[:n]
@@ -260,28 +262,28 @@ class SpatialLidar(Part):
             met = met._replace(ranges=jnp.where(met.ranges[:n] < sensor.range_max, mixed, met.ranges[:n]))
         return Met(met.ranges[:n], normal, met.thing[:n]), cosine, rays, origins[:n]
 
-    def _meet(self, origins: Array, rays: Array, sight: Sight, params: EnvParams) -> Met:
+    def _meet(self, origins: Array, rays: Array, sensing: SensingState, params: EnvParams) -> Met:
         """Return what rays meet; those of one place as an image, which GPUs take column by column."""
-        sensor, relief = params.lidar, self.relief(sight, params)
+        sensor, relief = params.lidar, self.relief(sensing, params)
         limit = jnp.asarray(sensor.range_max, jnp.float32)
         if sensor.sweep:
-            return meet(relief, origins, rays, sight.station, limit)
-        image = meet(relief, origins[0], rays.reshape(-1, sensor.shape[1], 3), sight.station, limit)
+            return meet(relief, origins, rays, sensing.station, limit)
+        image = meet(relief, origins[0], rays.reshape(-1, sensor.shape[1], 3), sensing.station, limit)
         return Met(*(part.reshape(len(rays), *part.shape[2:]) for part in image))
 
-    def observe(self, own: Any, sight: Sight, noise: Noise, params: EnvParams) -> dict[str, Array]:
+    def observe(self, own: Any, sensing: SensingState, noise: Noise, params: EnvParams) -> dict[str, Array]:
         """Return `scan`, m, and where asked `intensity`, 0 to 255, and `doppler`, m/s, row by row."""
         sensor, n = params.lidar, params.lidar.n_beams
         uniform = jnp.reshape(noise.uniform, (sensor.echo.n_uniform, n)).T if sensor.echo.n_uniform else None
         met, cosine, rays, origins = self.look(
-            own, sight, None if uniform is None else uniform[:, sensor.echo.losing :], params
+            own, sensing, None if uniform is None else uniform[:, sensor.echo.losing :], params
         )
-        ranges = sight.spoil(met.ranges)
+        ranges = sensing.corrupt(met.ranges)
         there = (ranges < sensor.range_max) & (ranges >= sensor.range_min)
         reflectivity = echo.albedo(met.normal[:, 2], met.thing, rays[:, 2] < 0.0)
         if sensor.texture is not None:
             ends = origins + met.ranges[:, None] * rays
-            factor, _ = wall_brightness(sight.tunnel, sight.station, sight.position, ends, sensor.texture)
+            factor, _ = wall_brightness(sensing.tunnel, sensing.station, sensing.position, ends, sensor.texture)
             reflectivity = jnp.where(met.thing, reflectivity, reflectivity * factor)
         if uniform is not None and sensor.echo.losing:
             there &= echo.returns(ranges, cosine, reflectivity, uniform[:, 0], sensor.echo)
@@ -291,18 +293,18 @@ class SpatialLidar(Part):
             shown = intensity(cosine, reflectivity, noise.normal[n : 2 * n], sensor.full_scale)
             entries["intensity"] = jnp.where(there, shown, 0.0)
         if sensor.doppler:
-            closing = jnp.sum(rays * self._velocity(own, sight, params), axis=-1)
+            closing = jnp.sum(rays * self._velocity(own, sensing, params), axis=-1)
             speeds = DOPPLER_SIGMA * noise.normal[-n:] - closing
             entries["doppler"] = jnp.where(there, jnp.clip(speeds, -DOPPLER_MOST, DOPPLER_MOST), 0.0)
         return entries
 
-    def _velocity(self, own: Sweeping, sight: Sight, params: EnvParams) -> Float[Array, "3"]:
+    def _velocity(self, own: Sweeping, sensing: SensingState, params: EnvParams) -> Float[Array, "3"]:
         """Return the sensor's mean velocity over the last step, tunnel frame, m/s; 0 at the start."""
-        mount, tunnel = params.lidar.mount, sight.tunnel
-        _, _, tangent_x, tangent_y, _ = at_station(tunnel, sight.station)
-        back = (own.position[0] - sight.position[0]) * tangent_x + (own.position[1] - sight.position[1]) * tangent_y
-        before, _ = stand(tunnel, own.position, own.heading, sight.station + back, mount)
-        now, _ = stand(tunnel, sight.position, sight.heading, sight.station, mount)
+        mount, tunnel = params.lidar.mount, sensing.tunnel
+        _, _, tangent_x, tangent_y, _ = at_station(tunnel, sensing.station)
+        back = (own.position[0] - sensing.position[0]) * tangent_x + (own.position[1] - sensing.position[1]) * tangent_y
+        before, _ = stand(tunnel, own.position, own.heading, sensing.station + back, mount)
+        now, _ = stand(tunnel, sensing.position, sensing.heading, sensing.station, mount)
         return (now - before) / jnp.asarray(params.vehicle.period)
 
     def space(self, params: EnvParams) -> dict[str, Bounds]:

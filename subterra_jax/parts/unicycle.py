@@ -40,7 +40,7 @@ def clip_action(action: Float[Array, "2"], params: VehicleParams) -> Float[Array
     """Clip a command `[v, ω]` to the robot's limits; a NaN is read as 0.
 
     Args:
-        action: Wanted forward speed (m/s) and yaw rate (rad/s, counter-clockwise); anything at all.
+        action: Needed forward speed (m/s) and yaw rate (rad/s, counter-clockwise); anything at all.
     """
     limit = jnp.stack([params.speed_max, params.yaw_rate_max])
     floor = jnp.stack([jnp.zeros_like(limit[0]), -limit[1]])

@@ -12,7 +12,7 @@ from subterra_jax.lidar import LidarParams, cast
 from subterra_jax.lidar3d import beams, casting
 from subterra_jax.lidar3d.relief import Relief
 from subterra_jax.lidar3d.space import into_tunnel, turned
-from subterra_jax.parts import Drive, Moved, PlanarLidar, Sight, SpatialLidar, Unicycle
+from subterra_jax.parts import Drive, Moved, PlanarLidar, SensingState, SpatialLidar, Unicycle
 from subterra_jax.parts.unicycle import wrap
 from subterra_jax.physics.engine import Body, Build, Engine
 from subterra_jax.physics.ground import Track, look_around, move_anchor
@@ -141,22 +141,26 @@ def _mean_motion(
 
 
 def lidar_pose(
-    ride: Ride, sight: Sight, track: Track, place: tuple[float, float, float], lateral: Float[Array, ""] | float = 0.0
+    ride: Ride,
+    sensing: SensingState,
+    track: Track,
+    place: tuple[float, float, float],
+    lateral: Float[Array, ""] | float = 0.0,
 ) -> tuple[Float[Array, "3"], Float[Array, "4"]]:
     """Return the origin (tunnel frame, m) and the rotation of a LiDAR at the moment that is shown.
 
     Args:
         ride: The robot, which gives height and lean.
-        sight: The moment, which gives position and heading; faults show an earlier one.
+        sensing: The moment, which gives position and heading; faults show an earlier one.
         place: Where the LiDAR stands on the trunk, m.
         lateral: Distance to the left of there, m.
     """
     x, y, z = place
     turn = ride.body.qpos[3:7]
-    turn = compose(yaw_quaternion(wrap(sight.heading - yaw(turn))), turn)
+    turn = compose(yaw_quaternion(wrap(sensing.heading - yaw(turn))), turn)
     height = track.position[ride.anchor, 2] + ride.body.qpos[2]
     arm = rotate(turn, jnp.stack([jnp.float32(x), y + lateral, jnp.float32(z)]))
-    return jnp.stack([*sight.position, height]) + arm, turn
+    return jnp.stack([*sensing.position, height]) + arm, turn
 
 
 @dataclasses.dataclass(frozen=True)
@@ -169,13 +173,13 @@ class SwayingLidar(PlanarLidar):
         """Return `lidar`, and `relief`: the surface that it sees; None for the planar tunnel with upright walls."""
         return {**super().defaults(), "relief": None}
 
-    def true_ranges(self, own: Any, sight: Sight, params: EnvParams) -> Array:
+    def true_ranges(self, own: Any, sensing: SensingState, params: EnvParams) -> Array:
         """Cast the beams from the trunk, m."""
-        ride = self.motion.ride(sight.parts[self.motion.name])
-        origin, turn = lidar_pose(ride, sight, params.track, self.motion.lidar_place)
-        return scan(origin, turn, ride.anchor, sight, params.track, params.lidar, params.relief)
+        ride = self.motion.ride(sensing.parts[self.motion.name])
+        origin, turn = lidar_pose(ride, sensing, params.track, self.motion.lidar_place)
+        return scan(origin, turn, ride.anchor, sensing, params.track, params.lidar, params.relief)
 
-    def skips_unwanted(self, params: EnvParams) -> bool:
+    def skips_unneeded(self, params: EnvParams) -> bool:
         """Tell that every scan is cast."""
         return False
 
@@ -193,23 +197,25 @@ class SwayingSpatialLidar(SpatialLidar):
         """Return `lidar`, and `relief`: the surface that it sees; None for that of the tunnel."""
         return {**super().defaults(), "relief": None}
 
-    def poses(self, own: Any, sight: Sight, params: EnvParams) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
+    def poses(
+        self, own: Any, sensing: SensingState, params: EnvParams
+    ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
         """Return origin (m) and direction of each beam, tunnel frame."""
-        sensor, ride = params.lidar, self.motion.ride(sight.parts[self.motion.name])
-        place, turn = lidar_pose(ride, sight, params.track, self.motion.lidar_place, sensor.mount.lateral)
+        sensor, ride = params.lidar, self.motion.ride(sensing.parts[self.motion.name])
+        place, turn = lidar_pose(ride, sensing, params.track, self.motion.lidar_place, sensor.mount.lateral)
         ahead, left, up = (tuple(rotate(turn, axis)) for axis in jnp.eye(3))
         directions = into_tunnel(turned((ahead, left, up), sensor.mount), sensor.directions)
         return jnp.broadcast_to(place, (sensor.n_beams, 3)), directions
 
-    def relief(self, sight: Sight, params: EnvParams) -> Relief:
-        return sight.tunnel.space.relief if params.relief is None else params.relief
+    def relief(self, sensing: SensingState, params: EnvParams) -> Relief:
+        return sensing.tunnel.space.relief if params.relief is None else params.relief
 
 
 def scan(
     origin: Float[Array, "3"],
     turn: Float[Array, "4"],
     anchor: Int[Array, ""],
-    sight: Sight,
+    sensing: SensingState,
     track: Track,
     sensor: LidarParams,
     relief: Relief | None,
@@ -222,7 +228,7 @@ def scan(
     Args:
         origin: Place of the LiDAR, tunnel frame, m.
         anchor: Row of the track nearest to it.
-        sight: The moment that is shown.
+        sensing: The moment that is shown.
         relief: The bore's surface, if there is one.
 
     Returns:
@@ -230,21 +236,23 @@ def scan(
     """
     directions = jnp.asarray(beams.planar(sensor.n_beams), jnp.float32)
     if relief is not None:
-        return casting.scan(relief, origin, turn, sight.station, directions, sensor.range_max)
+        return casting.scan(relief, origin, turn, sensing.station, directions, sensor.range_max)
     directions = casting.rotate(turn, directions)
     up = rotate(track.quaternion[anchor], jnp.array([0.0, 0.0, 1.0]))
     height = jnp.sum((origin - track.position[anchor]) * up) + track.protrusion[anchor]
-    nearest = jnp.minimum(_walls(origin, directions, sight), _ground(height, up, directions))
+    nearest = jnp.minimum(_walls(origin, directions, sensing), _ground(height, up, directions))
     return jnp.minimum(nearest, sensor.range_max)
 
 
-def _walls(origin: Float[Array, "3"], directions: Float[Array, "n_beams 3"], sight: Sight) -> Float[Array, "n_beams"]:
+def _walls(
+    origin: Float[Array, "3"], directions: Float[Array, "n_beams 3"], sensing: SensingState
+) -> Float[Array, "n_beams"]:
     """Distance to upright walls, m; `inf` where there are none within the tunnel's reach."""
     level = jnp.sqrt(directions[:, 0] ** 2 + directions[:, 1] ** 2)
     # A beam straight up meets no wall; the division must not make it NaN.
     level = jnp.maximum(level, 1e-3)
-    first = sight.tunnel.scan_first[node_at(sight.tunnel, sight.station)]
-    return cast.nearest(sight.tunnel, first, origin[:2], directions[:, :2] / level[:, None]) / level
+    first = sensing.tunnel.scan_first[node_at(sensing.tunnel, sensing.station)]
+    return cast.nearest(sensing.tunnel, first, origin[:2], directions[:, :2] / level[:, None]) / level
 
 
 def _ground(

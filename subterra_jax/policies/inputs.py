@@ -1,6 +1,6 @@
 """Inputs of a policy network, made from the named entries of an observation; training and driving both call `look`.
 
-What the agent is told and what it senses goes in, and nothing else: start and goal as reported, odometer, ranges, its
+What the agent is given and what it senses goes in, and nothing else: start and goal as reported, odometer, ranges, its
 own last command. Sizes come from the params. Every number is of order 1, so that nothing has to be normalised.
 """
 
@@ -67,10 +67,10 @@ def way_to_go(now: Reckoned, obs: Observed, params: EnvParams) -> Float[Array, "
     Without a goal it is the length of the tunnel less the distance driven.
     """
     driven = obs.distance - now.distance
-    if params.errand in ("cover", "report"):
+    if params.goal_kind in ("cover", "report"):
         return params.tunnel.length - driven
     out = obs.goal - told_start(obs, params)
-    if params.errand != "return":
+    if params.goal_kind != "return":
         return out - driven
     return jnp.where(now.flag > 0.5, out - params.goal.flag_reach - driven, out - driven)
 

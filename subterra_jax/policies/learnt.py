@@ -59,10 +59,10 @@ class Learnt(Trained):
 
     def try_out(self) -> None:
         """Compares names and shapes of the tensors with the network's."""
-        wanted = jax.eval_shape(lambda key: {NETWORK: init(self.layout.shape, key)}, jax.random.key(0))
+        needed = jax.eval_shape(lambda key: {NETWORK: init(self.layout.shape, key)}, jax.random.key(0))
         if self.layout.memory.kind == "along":
-            wanted[LOCALISER] = self.localiser_shapes()
-        self.check_tensors(wanted)
+            needed[LOCALISER] = self.localiser_shapes()
+        self.check_tensors(needed)
 
     def check_task(self, env: TunnelEnv, params: EnvParams, source: str | Path) -> None:
         """Refuses an observation of another size, and an action of another."""

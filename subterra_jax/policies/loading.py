@@ -81,16 +81,16 @@ def check_task(agent: Trained, env: TunnelEnv, params: EnvParams, source: str | 
     """Refuses a policy of another task: one that cannot read the observation, or has learnt something else.
 
     Raises:
-        PolicyError: Observations, errand, actions or control period are others than those it was trained with.
+        PolicyError: Observations, goal kind, actions or control period are others than those it was trained with.
     """
     agent.check_task(env, params, source)
-    bounds, errand = env.action_space(params), env.rule.errand
+    bounds, goal_kind = env.action_space(params), env.rule.goal_kind
     conditions = agent.conditions
     if conditions is not None:
         _check_period(conditions.period, _period(params), source, env.id)
-        learnt = TASKS[conditions.task].rule.errand if conditions.task in TASKS else errand
-        if agent.learns_errand and learnt != errand:
-            raise PolicyError(f"{source}: has learnt {conditions.task} (to {learnt}); {env.id} asks to {errand}")
+        learnt = TASKS[conditions.task].rule.goal_kind if conditions.task in TASKS else goal_kind
+        if agent.learns_goal_kind and learnt != goal_kind:
+            raise PolicyError(f"{source}: has learnt {conditions.task} (to {learnt}); {env.id} asks to {goal_kind}")
     high = np.asarray(agent.high)
     if not np.allclose(high, bounds.high[: len(high)]):
         raise PolicyError(f"{source}: made for actions up to {high.tolist()}, {env.id} has {bounds.high.tolist()}")
@@ -99,7 +99,7 @@ def check_task(agent: Trained, env: TunnelEnv, params: EnvParams, source: str | 
 def training_conditions(env: Any, params: Any) -> Conditions:
     """Returns the conditions of an environment, as a policy that is trained in it carries them.
 
-    How far a hidden start is off is none of them: it changes what a robot is told, not what it senses or does. A robot
+    How far a hidden start is off is none of them: it changes what a robot is given, not what it senses or does. A robot
     by physics has no digest of constants: it may be asked how any policy does there.
     """
     given = params.replace(start=params.start.replace(station_sigma=0.0))

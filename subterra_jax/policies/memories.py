@@ -70,7 +70,7 @@ class Memory:
         reckoned = inputs.begin(obs)
         located = None
         if self.locates:
-            localiser, anywhere = given.localiser(params), params.errand == "report"
+            localiser, anywhere = given.localiser(params), params.goal_kind == "report"
             start, sigma = believed_start(obs, params) if anywhere else (told_start(obs, params), 0.05)
             station = Station(jnp.asarray(start, jnp.float32), jnp.log(jnp.float32(sigma)), jnp.ones(()))
             located = Located(CentreLine().begin(obs, params), jnp.ones(()), localiser.begin(obs, params), station)
@@ -116,16 +116,16 @@ class Memory:
             station = kept.located.station
             return station.station, station.log_sigma, station.direction
         way = inputs.way_to_go(kept.reckoned, obs, params)
-        target = obs.goal if params.errand in ("stop", "return") else params.tunnel.length
+        target = obs.goal if params.goal_kind in ("stop", "return") else params.tunnel.length
         out = target - way
-        if params.errand == "return":
+        if params.goal_kind == "return":
             out = jnp.where(kept.reckoned.flag > 0.5, told_start(obs, params) + way, out)
         return out, jnp.log(jnp.float32(1.0)), jnp.where(kept.reckoned.turned, -1.0, 1.0)
 
     def _look(self, reckoned: Reckoned, located: Located | None, obs: Observed, params: EnvParams) -> Array:
         way = inputs.way_to_go(reckoned, obs, params)
         log_sigma = jnp.zeros(())
-        if located is not None and params.errand == "report":
+        if located is not None and params.goal_kind == "report":
             # As far as it surely may: who drives on for longer than allowed has failed.
             doubt = _SURE * odometry_sigma(params.goal.travel_max, jnp.zeros(()), params)
             way = params.goal.travel_max - doubt - (obs.distance - reckoned.distance)
@@ -133,7 +133,7 @@ class Memory:
         elif located is not None:
             station, log_sigma = located.station.station, located.station.log_sigma
             way = obs.goal - station
-            if params.errand == "return":
+            if params.goal_kind == "return":
                 way = jnp.where(reckoned.flag > 0.5, station - told_start(obs, params), way)
         seen = inputs.look(reckoned, obs, way, params, self.relief)
         return jnp.append(seen, log_sigma) if self.locates else seen
@@ -171,4 +171,4 @@ class Given:
         if isinstance(self.map, HistogramLocaliser):
             return self.map
         locator = Locator(self.weights, self.map, self.blind)
-        return TwoWays(locator) if params.errand == "return" else locator
+        return TwoWays(locator) if params.goal_kind == "return" else locator

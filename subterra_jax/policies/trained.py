@@ -28,7 +28,7 @@ class Trained(Agent):
 
     kind: ClassVar[str]  # name of the kind in a policy's facts
     prefix: ClassVar[str] = "localiser."  # beginning of the names of the localiser's tensors, if any
-    learns_errand: ClassVar[bool] = True  # it has learnt one errand, and drives no task with another
+    learns_goal_kind: ClassVar[bool] = True  # it has learnt one goal kind, and drives no task with another
     tensors: Any  # weights by name, as a policy's file holds them
     low: Any  # smallest action, m/s and rad/s
     high: Any  # largest action, m/s and rad/s
@@ -63,7 +63,7 @@ class Trained(Agent):
 
     @abc.abstractmethod
     def check_task(self, env: TunnelEnv, params: EnvParams, source: str | Path) -> None:
-        """Refuses a task whose errand or observation it does not know; the message begins with `source`.
+        """Refuses a task whose goal kind or observation it does not know; the message begins with `source`.
 
         Raises:
             PolicyError: It cannot do this task.
@@ -86,9 +86,9 @@ class Trained(Agent):
         front = memory.front_of(part(self.tensors, self.prefix))
         return jax.eval_shape(lambda key: memory.init(front, key, self.takes_map), jax.random.key(0))
 
-    def check_tensors(self, wanted: Any) -> None:
-        """Compares names and shapes of the tensors with those wanted; errors as `try_out`."""
-        shapes = flat(wanted)
+    def check_tensors(self, needed: Any) -> None:
+        """Compares names and shapes of the tensors with those needed; errors as `try_out`."""
+        shapes = flat(needed)
         for name, leaf in shapes.items():
             if self.tensors[name].shape != leaf.shape:
                 raise ValueError(f"{name} is {self.tensors[name].shape}, not {leaf.shape}")
@@ -97,7 +97,7 @@ class Trained(Agent):
 
     def with_map(self, params: EnvParams) -> Self:
         """Returns the agent with the map of a task if it takes one; runs on the host. A way back is driven without."""
-        if not self.takes_map or self.hides_map or self.blind or params.errand != "stop":
+        if not self.takes_map or self.hides_map or self.blind or params.goal_kind != "stop":
             return self
         return self._with(map=map_strip(params.tunnel))
 

@@ -26,11 +26,11 @@ class RelocaliseState(GoalState):
 class Relocalise(GoalRule):
     """Success is a right report at the stop: the one in the action of the step that makes it a stop.
 
-    No mouth comes into sight within the travel that is allowed.
+    No mouth comes into view within the travel that is allowed.
     """
 
     key: ClassVar[str] = "relocalise"
-    errand: ClassVar[str] = "report"
+    goal_kind: ClassVar[str] = "report"
     reports: ClassVar[bool] = True
 
     def start(self, draw: tuple[Array, Array, Array], tunnel: Tunnel, params: EnvParams) -> Start:

@@ -15,7 +15,7 @@ from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel import Tunnel
 
 Terms = dict[str, Float[Array, ""]]
-ERRANDS = ("cover", "stop", "return", "report")
+GOAL_KINDS = ("cover", "stop", "return", "report")
 
 
 @struct.dataclass
@@ -91,8 +91,8 @@ class Rule(abc.ABC):
     Attributes:
         key: Name of the rule in the digest of the constants, where a rename of the class leaves it; by default the
             class's name.
-        errand: What agents are asked to do: `cover` (drive on), `stop` (at the observed `goal`), `return` (to the start
-            once the observed `flag` is raised) or `report` (stop and say where).
+        goal_kind: What agents are asked to do: `cover` (drive on), `stop` (at the observed `goal`), `return` (to the
+            start once the observed `flag` is raised) or `report` (stop and say where).
         reports: The action holds an estimate that counts.
         covers: Success is coverage. An evaluation then drives on after success, and counts how far the robot comes.
         needs: Names of the parts that the rule cannot do without.
@@ -100,7 +100,7 @@ class Rule(abc.ABC):
     """
 
     key: ClassVar[str]
-    errand: ClassVar[str] = "cover"
+    goal_kind: ClassVar[str] = "cover"
     reports: ClassVar[bool] = False
     covers: ClassVar[bool] = False
     needs: ClassVar[tuple[str, ...]] = ()

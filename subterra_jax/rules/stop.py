@@ -70,9 +70,9 @@ class GoalRewardParams:
 
 @struct.dataclass
 class ToldParams:
-    """Errors of what an agent is told."""
+    """Errors of what an agent is given."""
 
-    # relative error of the ring length told against that of the tunnel's drawings, 1; for ablations
+    # relative error of the ring length reported against that of the tunnel's drawings, 1; for ablations
     pitch_error: float = 0.0
 
 
@@ -86,10 +86,10 @@ class GoalState:
 
 @struct.dataclass
 class StopState(GoalState):
-    """Goal of one episode, and what is told."""
+    """Goal of one episode, and what is reported."""
 
-    told: Float[Array, ""]  # station of the start as it is told, m
-    pitch: Float[Array, ""]  # ring length as it is told, m; 0 where there are no rings
+    told: Float[Array, ""]  # station of the start as reported, m
+    pitch: Float[Array, ""]  # ring length as reported, m; 0 where there are no rings
 
 
 class GoalRule(Rule):
@@ -125,7 +125,7 @@ class StopAt(GoalRule):
     """
 
     key: ClassVar[str] = "stop"
-    errand: ClassVar[str] = "stop"
+    goal_kind: ClassVar[str] = "stop"
 
     def defaults(self) -> dict[str, Any]:
         return {**super().defaults(), "told": ToldParams()}
@@ -139,7 +139,7 @@ class StopAt(GoalRule):
         return Start(told + offset, **spread(draw[0], params), own=own)
 
     def place(self, start: Start, choice: Choice) -> Start:
-        """Return a start with a chosen place, which is told as it is, and goal; a drawn goal keeps its distance."""
+        """Return a start with a chosen place, which is reported as it is, and goal; a drawn goal keeps its distance."""
         own = start.own
         told = chosen(choice.station, own.told)
         goal = chosen(choice.goal, own.station + told - own.told)

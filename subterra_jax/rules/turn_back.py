@@ -1,4 +1,4 @@
-"""T2: drive to the goal, turn round, and stop where the episode was told to begin."""
+"""T2: drive to the goal, turn round, and stop where the episode was asked to begin."""
 
 import dataclasses
 from typing import ClassVar
@@ -16,17 +16,17 @@ from subterra_jax.tunnel import Tunnel
 
 @struct.dataclass
 class ReturnState(StopState):
-    """Goal of one episode, and whether the robot is on its way back, which ends at the station told as the start."""
+    """Goal of one episode, and whether the robot is on its way back, which ends at the start as reported."""
 
     flag: Float[Array, ""]  # 1 once the goal has been reached, else 0
 
 
 @dataclasses.dataclass(frozen=True)
 class TurnBack(StopAt):
-    """Success is a stop at the station told as the start, after the flag at the goal was raised."""
+    """Success is a stop at the station reported as the start, after the flag at the goal was raised."""
 
     key: ClassVar[str] = "return"
-    errand: ClassVar[str] = "return"
+    goal_kind: ClassVar[str] = "return"
 
     def start(self, draw: tuple[Array, Array, Array], tunnel: Tunnel, params: EnvParams) -> Start:
         start = super().start(draw, tunnel, params)

@@ -146,8 +146,8 @@ def _numbers(name: str, values: ArrayLike, shape: tuple[int | None, ...]) -> np.
     except (TypeError, ValueError) as error:
         raise TunnelError(f"{name} must hold numbers ({error})") from error
     if array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True)):
-        wanted = ", ".join("n" if n is None else str(n) for n in shape)
-        raise TunnelError(f"{name} must have shape ({wanted}), got {array.shape}")
+        needed = ", ".join("n" if n is None else str(n) for n in shape)
+        raise TunnelError(f"{name} must have shape ({needed}), got {array.shape}")
     if not np.all(np.isfinite(array)):
         place = f" at index {np.argwhere(~np.isfinite(array))[0].tolist()}" if array.ndim else ""
         raise TunnelError(f"{name} is not finite{place}")

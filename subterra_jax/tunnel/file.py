@@ -55,8 +55,8 @@ class _Fields:
         if value.dtype.kind not in "fiu":
             raise self.fail(field, f"must hold numbers, holds {value.dtype}")
         if value.ndim != len(shape) or any(w is not None and w != h for w, h in zip(shape, value.shape, strict=True)):
-            wanted = ", ".join("any" if w is None else str(w) for w in shape)
-            raise self.fail(field, f"must have shape ({wanted}), has {value.shape}")
+            needed = ", ".join("any" if w is None else str(w) for w in shape)
+            raise self.fail(field, f"must have shape ({needed}), has {value.shape}")
         if not np.all(np.isfinite(value)):
             where = np.argwhere(~np.isfinite(value))[0].tolist()
             raise self.fail(field, f"has a value that is not finite, at index {where}")

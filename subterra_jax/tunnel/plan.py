@@ -58,7 +58,7 @@ class TunnelPlan:
         half_width: Half the distance between the smooth walls, m, `(n,)`.
         lidar_height: Height of the LiDAR plane above `elevation`, m.
         linings: Variant name to its walls.
-        ring_pitch: Distance between ring joints by the drawings, which agents are told, m; 0 without rings, or if
+        ring_pitch: Distance between ring joints by the drawings, which agents are given, m; 0 without rings, or if
             unknown. Pockets repeat with it.
         shell: The bore in three dimensions; `None` where it is not known.
         source: File that it was read from; empty if from none.

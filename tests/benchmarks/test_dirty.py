@@ -70,7 +70,7 @@ def test_a_scene_that_is_the_truth_has_no_errors(tmp_path: Path, truth: Truth) -
 
 
 @pytest.mark.parametrize(
-    ("spoil", "named"),
+    ("corrupt", "named"),
     [
         ({"half": HALF + 0.05}, "width +10 cm"),
         ({"half": HALF + 0.05}, "walls 5.0 cm in the mean"),
@@ -80,9 +80,9 @@ def test_a_scene_that_is_the_truth_has_no_errors(tmp_path: Path, truth: Truth) -
         ({"sleeper": 4.0}, "sleeper F1 0.00"),
     ],
 )
-def test_each_fault_of_a_scene_is_named(tmp_path: Path, truth: Truth, spoil: dict, named: str) -> None:
-    length, sleeper = spoil.pop("length", LENGTH), spoil.pop("sleeper", 3.0)
-    folder = scene_folder(tmp_path / "scene", outline(**spoil), length)
+def test_each_fault_of_a_scene_is_named(tmp_path: Path, truth: Truth, corrupt: dict, named: str) -> None:
+    length, sleeper = corrupt.pop("length", LENGTH), corrupt.pop("sleeper", 3.0)
+    folder = scene_folder(tmp_path / "scene", outline(**corrupt), length)
     truth = replace(truth, sleepers=truth.sleepers + np.array([sleeper - 3.0, 0.0, 0.0]))
     faults = [fault.text for fault in list_faults(judge_scene(folder, truth))]
     assert any(named in fault for fault in faults), faults

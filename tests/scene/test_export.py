@@ -48,11 +48,11 @@ def first_hits(mesh: trimesh.Trimesh, origins: np.ndarray, headings: np.ndarray)
     return distance
 
 
-def agree(found: np.ndarray, wanted: np.ndarray) -> None:
-    both = np.isfinite(found) & np.isfinite(wanted)
+def agree(found: np.ndarray, expected: np.ndarray) -> None:
+    both = np.isfinite(found) & np.isfinite(expected)
     assert both.mean() > 0.9
-    assert np.mean(np.isfinite(found) == np.isfinite(wanted)) > 0.999
-    assert np.mean(np.abs(found[both] - wanted[both]) < 1e-3) > 0.999  # but at edges
+    assert np.mean(np.isfinite(found) == np.isfinite(expected)) > 0.999
+    assert np.mean(np.abs(found[both] - expected[both]) < 1e-3) > 0.999  # but at edges
 
 
 def load_usd(path) -> trimesh.Trimesh:
@@ -98,5 +98,5 @@ def load_sdf(path) -> trimesh.Trimesh:
 def test_rays_meet_the_export_where_they_meet_the_mjcf(scene, rays, tmp_path, to, name, load):
     out = tmp_path / name
     assert main([str(scene), "--to", to, "--out", str(out), "--licence", "CC0"]) == 0
-    origins, headings, wanted = rays
-    agree(first_hits(load(out), origins, headings), wanted)
+    origins, headings, expected = rays
+    agree(first_hits(load(out), origins, headings), expected)

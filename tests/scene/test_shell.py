@@ -115,7 +115,7 @@ def built(arc_scene):
     return arc_scene[0], load_tunnel(arc_scene[0] / "tunnel.npz")
 
 
-def spoiled(folder, target, **changed):
+def corrupted(folder, target, **changed):
     """A copy of the tunnel file with other fields; those that are `None` are gone."""
     with np.load(folder / "tunnel.npz") as data:
         fields = {name: data[name] for name in data.files} | changed
@@ -141,9 +141,9 @@ def test_every_corner_of_the_shell_is_one_of_the_scene_and_the_other_way_round(b
 def test_the_axis_is_that_of_the_bore(built):
     folder, plan = built
     axis, _ = rolled.raise_shell(plan.shell, "pockets")
-    wanted = load_bore(folder / "bore.npz")
-    np.testing.assert_allclose(axis.position, wanted.position, atol=2e-5)
-    np.testing.assert_allclose(axis.tangent, wanted.tangent, atol=2e-5)
+    expected = load_bore(folder / "bore.npz")
+    np.testing.assert_allclose(axis.position, expected.position, atol=2e-5)
+    np.testing.assert_allclose(axis.tangent, expected.tangent, atol=2e-5)
 
 
 def test_the_radius_is_kept_to_a_tenth_of_a_millimetre(built, bore):
@@ -167,8 +167,8 @@ def test_a_piece_has_its_part_of_the_axis_and_no_point_moves(built):
     axis, surface = rolled.raise_shell(built[1].slice(6.0, 12.0).slice(1.0, 10.0).shell, "pockets")
     assert axis.station[0] == 0.0
     assert axis.station[-1] == pytest.approx(10.0)
-    wanted = np.stack([np.interp(7.0 + axis.station, whole_axis.station, x) for x in whole_axis.position.T], axis=-1)
-    np.testing.assert_allclose(axis.position, wanted, atol=1e-9)
+    expected = np.stack([np.interp(7.0 + axis.station, whole_axis.station, x) for x in whole_axis.position.T], axis=-1)
+    np.testing.assert_allclose(axis.position, expected, atol=1e-9)
     points = [part.vertices[np.unique(part.faces)] for part in (surface, whole)]
     at = [cKDTree(whole_axis.position).query(part)[1] * whole_axis.station[1] for part in points]
     kept = [part[(s > 6.0) & (s < 18.0)] for part, s in zip(points, at, strict=True)]
@@ -186,7 +186,7 @@ def test_a_file_without_the_shell_gives_the_plane(built, tmp_path):
     folder, plan = built
     with np.load(folder / "tunnel.npz") as data:
         shell = {name: None for name in data.files if name.startswith("shell_")}
-    flat = read_tunnel(spoiled(folder, tmp_path / "flat.npz", **shell))
+    flat = read_tunnel(corrupted(folder, tmp_path / "flat.npz", **shell))
     assert flat.shell is None
     np.testing.assert_array_equal(flat.linings["pockets"].left.vertex, plan.linings["pockets"].left.vertex)
 
@@ -202,10 +202,10 @@ def test_a_file_without_the_shell_gives_the_plane(built, tmp_path):
         ({"shell_pocket_pockets": np.zeros((2, 4))}, r"field 'shell_pocket_pockets' must have shape \(any, 5\)"),
     ],
 )
-def test_a_spoiled_field_is_named(built, tmp_path, changed, says):
+def test_a_corrupted_field_is_named(built, tmp_path, changed, says):
     assert len(built[1].station) == 98
     with pytest.raises(TunnelError, match=says):
-        read_tunnel(spoiled(built[0], tmp_path / "spoiled.npz", **changed))
+        read_tunnel(corrupted(built[0], tmp_path / "spoiled.npz", **changed))
 
 
 def test_an_unknown_lining_is_named(built):

@@ -1,4 +1,4 @@
-"""Several agents in one compiled program, and agents whose observation is spoilt: for tests of leaks."""
+"""Several agents in one compiled program, and agents whose observation is corrupted: for tests of leaks."""
 
 import dataclasses
 from typing import Any
@@ -18,7 +18,7 @@ class Panel:
         agents: The agents.
         index: Which of them acts.
         order: In which order it gets the beams.
-        goal: Goal that it is told; NaN tells it the true one.
+        goal: Goal that it is reported; NaN tells it the true one.
     """
 
     agents: tuple[Any, ...]
@@ -31,16 +31,16 @@ class Panel:
     privileged: bool = struct.field(pytree_node=False, default=True)
 
     def begin(self, key, obs, params):
-        return tuple(agent.begin(key, self._spoilt(obs, agent), params) for agent in self.agents)
+        return tuple(agent.begin(key, self._corrupted(obs, agent), params) for agent in self.agents)
 
     def act(self, key, memory, obs, params, known):
         pairs = [
-            agent.act(key, m, self._spoilt(obs, agent), params, known if agent.privileged else None)
+            agent.act(key, m, self._corrupted(obs, agent), params, known if agent.privileged else None)
             for agent, m in zip(self.agents, memory, strict=True)
         ]
         return jnp.stack([action for action, _ in pairs])[self.index], tuple(m for _, m in pairs)
 
-    def _spoilt(self, obs: Observed, agent: Any) -> Observed:
+    def _corrupted(self, obs: Observed, agent: Any) -> Observed:
         ranges = obs.ranges[self.order] if agent.uses_lidar else jnp.full_like(obs.ranges, jnp.nan)
         goal = None if obs.goal is None else jnp.where(jnp.isnan(self.goal), obs.goal, self.goal)
         return dataclasses.replace(obs, ranges=ranges, goal=goal)

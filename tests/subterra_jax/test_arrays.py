@@ -188,7 +188,7 @@ def test_a_tunnel_of_20_km_is_checked_in_a_moment():
 
 @pytest.mark.door
 @pytest.mark.parametrize(
-    ("spoil", "message"),
+    ("corrupt", "message"),
     [
         (lambda a: {"tangent": -a["tangent"]}, "field 'tangent' is flipped at index 0"),
         (lambda a: {"tangent": np.where(np.arange(len(a["tangent"]))[:, None] == 9, -1, 1) * a["tangent"]}, "index 9"),
@@ -199,9 +199,9 @@ def test_a_tunnel_of_20_km_is_checked_in_a_moment():
         (lambda a: {"right_pockets": a["left_pockets"]}, "field 'right_pockets' lies to the other side"),
     ],
 )
-def test_a_file_written_by_hand_is_checked_like_arrays(plan_of, spoil, message):
+def test_a_file_written_by_hand_is_checked_like_arrays(plan_of, corrupt, message):
     whole = tunnel_arrays(straight(40.0))
     plan_of(whole)
     with pytest.raises(st.TunnelError, match=message) as caught:
-        plan_of({**whole, **spoil(whole)})
+        plan_of({**whole, **corrupt(whole)})
     assert "\n" not in str(caught.value)

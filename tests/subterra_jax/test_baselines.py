@@ -59,10 +59,10 @@ def test_beams_without_echo_and_beams_in_dust_do_not_move_the_walls(params):
     clean = between_walls(2.8, 2.8, 0.0)
     found = steering.find_walls(jnp.asarray(clean), params)
     for i in range(30):
-        spoilt = clean.copy()
-        spoilt[(np.arange(6) + i) % 16] = 30.0
-        spoilt[(i * 5) % 16] *= 0.3
-        found = look(found, jnp.asarray(spoilt), params)
+        corrupted = clean.copy()
+        corrupted[(np.arange(6) + i) % 16] = 30.0
+        corrupted[(i * 5) % 16] *= 0.3
+        found = look(found, jnp.asarray(corrupted), params)
         assert abs(found.offset) < 0.1
         assert abs(found.angle) < 0.05
 
@@ -80,7 +80,7 @@ def test_the_last_period_before_the_goal_just_reaches_it(params):
     start, speed = navigator.start_mission(obs), []
     for station in (30.0, 39.9, 40.5):
         estimate = Station(jnp.float32(station), jnp.zeros(()), jnp.ones(()))
-        speed.append(float(navigator.target_speed(start, estimate, obs, params.replace(errand="stop"))))
+        speed.append(float(navigator.target_speed(start, estimate, obs, params.replace(goal_kind="stop"))))
     np.testing.assert_allclose(speed, [2.0, 1.0, 0.0], atol=1e-4)
     there = navigator.check_arrival(start, jnp.float32(1.0), jnp.float32(1.0), params)
     assert there.stopped
@@ -96,7 +96,7 @@ def test_it_turns_by_half_a_turn_once_the_flag_is_up_and_never_stands_for_it(par
         flag = 1.0 if step >= 5 else 0.0
         wrapped = (heading + np.pi) % (2 * np.pi) - np.pi
         obs = observation(heading=jnp.float32(wrapped), flag=jnp.float32(flag), goal=jnp.float32(9.0))
-        now, raised, _ = navigator.watch(now, obs, params.replace(errand="return"))
+        now, raised, _ = navigator.watch(now, obs, params.replace(goal_kind="return"))
         assert bool(raised) == (step == 5)
         if navigator.is_turning(now):
             speed, rate = np.asarray(navigator.turn_command(now, params))

@@ -55,13 +55,13 @@ def test_every_severity_is_drawn_alike():
     assert np.abs(counts - N / 5).max() < 4 * np.sqrt(N * 0.2 * 0.8)
 
 
-def test_at_severity_0_nothing_is_spoilt():
+def test_at_severity_0_nothing_is_corrupted():
     params = faults.FaultParams(severity_low=0, severity_high=0)
     state = run(params, 30)[-1]
     draw = jax.random.uniform(jax.random.key(5), (N, faults.n_step_noise(BEAMS)))
     ranges = jnp.full((N, BEAMS), 3.0)
-    spoilt = each(faults.spoil, (0, 0, 0, None, None))(ranges, state, draw, jnp.float32(30.0), params)
-    np.testing.assert_array_equal(spoilt, ranges)
+    corrupted = each(faults.corrupt, (0, 0, 0, None, None))(ranges, state, draw, jnp.float32(30.0), params)
+    np.testing.assert_array_equal(corrupted, ranges)
     assert not each(faults.frozen, 0)(state).any()
     np.testing.assert_array_equal(each(faults.observed, (0, None))(state, params)[:, 0], 30.0)
     np.testing.assert_array_equal(each(faults.grip, (0, None, None))(state, np.float32(5.0), params), 1.0)
@@ -71,9 +71,9 @@ def test_dust_reflects_the_stated_share_of_beams_somewhere_before_the_wall():
     params = dataclasses.replace(ZERO, dust_rate=0.15)
     draw = jax.random.uniform(jax.random.key(5), (N, faults.n_step_noise(BEAMS)))
     ranges = np.full((N, BEAMS), 3.0, np.float32)
-    spoilt = each(faults.spoil, (0, 0, 0, None, None))(ranges, begun(params), draw, np.float32(30.0), params)
-    short = np.asarray(spoilt)[np.asarray(spoilt) < 3.0]
-    assert abs(short.size / spoilt.size - 0.15) < 4 * np.sqrt(0.15 * 0.85 / spoilt.size)
+    corrupted = each(faults.corrupt, (0, 0, 0, None, None))(ranges, begun(params), draw, np.float32(30.0), params)
+    short = np.asarray(corrupted)[np.asarray(corrupted) < 3.0]
+    assert abs(short.size / corrupted.size - 0.15) < 4 * np.sqrt(0.15 * 0.85 / corrupted.size)
     assert abs(short.mean() - 1.5) < 4 * 3.0 / np.sqrt(12 * short.size)
 
 
@@ -81,15 +81,15 @@ def test_dropped_beams_are_one_sector_that_reports_the_largest_range():
     params = dataclasses.replace(ZERO, dropout_rate=0.5, dropout_share=0.75)
     state = run(params, 5)[-1]
     draw = jnp.zeros(faults.n_step_noise(BEAMS))
-    spoilt = np.asarray(
-        jax.jit(jax.vmap(faults.spoil, (0, 0, None, None, None)))(
+    corrupted = np.asarray(
+        jax.jit(jax.vmap(faults.corrupt, (0, 0, None, None, None)))(
             jnp.full((N, BEAMS), 3.0), state, draw, jnp.float32(30.0), params
         )
     )
-    out = spoilt == 30.0
+    out = corrupted == 30.0
     some = out.any(axis=1)
     assert some.mean() > 0.5
-    assert (spoilt[~out] == 3.0).all()
+    assert (corrupted[~out] == 3.0).all()
     # One sector: round the turn, beams change from in to out exactly once.
     changes = (out[some] != np.roll(out[some], 1, axis=1)).sum(axis=1)
     assert (changes == 2).all()

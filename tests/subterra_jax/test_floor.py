@@ -1,4 +1,4 @@
-"""The floor: known answers, and a station that was told is noticed above it."""
+"""The floor: known answers, and a station that was reported is noticed above it."""
 
 import dataclasses
 import math
@@ -78,8 +78,8 @@ class Gossip(Part):
     def normals(self, params):
         return 1
 
-    def observe(self, own, sight, noise, params):
-        return {"gossip": sight.station + noise.normal}
+    def observe(self, own, sensing, noise, params):
+        return {"gossip": sensing.station + noise.normal}
 
     def space(self, params):
         return {"gossip": (-np.inf, np.inf)}

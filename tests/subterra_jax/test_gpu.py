@@ -35,17 +35,21 @@ nodes = jax.jit(jax.vmap(node_at, (None, 0)))  # eager code would compile every 
 
 
 def scan_by_kernel(
-    tunnel: Tunnel, poses: reference.Poses, wanted: np.ndarray | None = None, n_beams: int = 16, range_max: float = 30.0
+    tunnel: Tunnel,
+    poses: reference.Poses,
+    expected: np.ndarray | None = None,
+    n_beams: int = 16,
+    range_max: float = 30.0,
 ) -> np.ndarray:
-    wanted = np.ones(len(poses.station), bool) if wanted is None else wanted
-    rows = poses.position, poses.heading, poses.station, wanted
+    expected = np.ones(len(poses.station), bool) if expected is None else expected
+    rows = poses.position, poses.heading, poses.station, expected
     return np.asarray(_scan(tunnel, *rows, np.float32(range_max), n_beams))
 
 
 @partial(jax.jit, static_argnames="n_beams")
-def _scan(tunnel, position, heading, station, wanted, range_max, n_beams):
+def _scan(tunnel, position, heading, station, expected, range_max, n_beams):
     start = tunnel.visit_first[jax.vmap(node_at, (None, 0))(tunnel, station)]
-    return gpu.scan(tunnel, position, heading, start, wanted, range_max, lidar.bearings(n_beams))
+    return gpu.scan(tunnel, position, heading, start, expected, range_max, lidar.bearings(n_beams))
 
 
 @pytest.mark.parametrize("n_beams", [1, 12, 16])
@@ -81,7 +85,7 @@ def test_ranges_are_clipped_at_the_largest(plan: st.TunnelPlan) -> None:
     assert ranges.min() < 4.0
 
 
-def test_wanted_scans_do_not_depend_on_the_unwanted_ones(plan: st.TunnelPlan) -> None:
+def test_needed_scans_do_not_depend_on_the_unneeded_ones(plan: st.TunnelPlan) -> None:
     poses = reference.random_poses(plan, 96, np.random.default_rng(2))
     tunnel = Tunnel.from_plan(plan)
     some, everything = (scan_by_kernel(tunnel, poses, mask) for mask in (np.arange(96) == 50, np.ones(96, bool)))

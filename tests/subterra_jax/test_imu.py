@@ -102,12 +102,12 @@ def check_densities(n_steps, taus):
     for name, axes in (("accel", slice(0, 3)), ("gyro", slice(3, 6))):
         density, walk = STATED[f"{name}_density"], STATED[f"{name}_walk"]
         for tau, found in deviation.items():
-            wanted = np.hypot(density / np.sqrt(tau), walk * np.sqrt(tau / 3.0))
+            expected = np.hypot(density / np.sqrt(tau), walk * np.sqrt(tau / 3.0))
             if tau <= 30.0:  # an hour has few longer intervals, so of those the three axes together alone
-                np.testing.assert_allclose(found[axes], wanted, rtol=0.15)
+                np.testing.assert_allclose(found[axes], expected, rtol=0.15)
             intervals = 3 * len(samples) / (100.0 * tau)
             within = min(4.0 / np.sqrt(2.0 * intervals), 0.15)  # four standard errors
-            assert np.sqrt(np.mean(found[axes] ** 2)) == pytest.approx(wanted, rel=within)
+            assert np.sqrt(np.mean(found[axes] ** 2)) == pytest.approx(expected, rel=within)
         assert np.std(np.diff(bias[:, axes], axis=0)) == pytest.approx(walk * np.sqrt(0.1), rel=0.05)
 
 

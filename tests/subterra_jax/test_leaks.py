@@ -38,8 +38,10 @@ def control():
     agents = [make_agent(name, params) for name in STOPPING + BLIND]
     episodes = listed_episodes(env, params, N)
 
-    def success(name, **spoilt):
-        return evaluate(env, params, panel(agents, (STOPPING + BLIND).index(name), **spoilt), episodes).success.mean()
+    def success(name, **corrupted):
+        return evaluate(
+            env, params, panel(agents, (STOPPING + BLIND).index(name), **corrupted), episodes
+        ).success.mean()
 
     return success, {"odometry": odometry_bound(params), "fused": floor(params)}
 

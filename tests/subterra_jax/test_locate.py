@@ -80,7 +80,7 @@ def test_a_robot_makes_the_metres_of_its_training(front, with_map):
     n = int(driven[-1])
     record = streams.Record(jnp.asarray(driven, jnp.float32), read, points)
     whole = memory.sequence(weights, streams.metres(record, weights["match"], n))
-    strip = map_of_walls(first=-3.0 - 0.7) if with_map else None  # told 0.7 m too far back
+    strip = map_of_walls(first=-3.0 - 0.7) if with_map else None  # reported 0.7 m too far back
     if strip is not None:
         age = jnp.arange(1.0, n + 1.0)
         passed, rate = memory.passed(whole, age), memory.log_rate(whole, age)
@@ -88,7 +88,7 @@ def test_a_robot_makes_the_metres_of_its_training(front, with_map):
         beliefs = map_filter.sequence(weights["map"], seen, streams.BEFORE, strip.pick(0), told, sure, passed, rate)
         whole = jax.vmap(map_filter.corrected, (0, 0, 0, None))(beliefs, whole, age, sure)
     params = SimpleNamespace(
-        errand="stop",
+        goal_kind="stop",
         tunnel=SimpleNamespace(first_node=jnp.zeros((), jnp.int32)),
         start=SimpleNamespace(station=3.0, station_sigma=0.0),
         vehicle=SimpleNamespace(period=0.1),
@@ -156,7 +156,7 @@ def test_a_localiser_drives_where_it_can_and_is_refused_in_a_sentence_elsewhere(
 def test_another_number_of_beams_or_another_control_period_is_named():
     env, params = st.make("Subterra/StopAt-v1")
     agent = _trained(env, params)
-    check_fits(agent, *st.make("Subterra/StopAt-v1", hidden_start=True), agent.name)  # told otherwise, sensed alike
+    check_fits(agent, *st.make("Subterra/StopAt-v1", hidden_start=True), agent.name)  # given another, sensed alike
     slippery = params.replace(slip=params.slip.replace(gain_sigma=0.5))
     for other, sentence in (
         (slippery, "trained under constants"),
@@ -179,7 +179,7 @@ def _way(ways, driven, direction, flagged, now, params):
 
 def test_a_way_back_begins_at_the_place_that_the_flag_tells():
     params = SimpleNamespace(
-        errand="return",
+        goal_kind="return",
         start=SimpleNamespace(station=50.0, station_sigma=0.0),
         vehicle=SimpleNamespace(period=0.1),
         lidar=SimpleNamespace(range_max=30.0),

@@ -82,8 +82,8 @@ def test_clearances_are_exact_within_their_reach(plan):
 def test_a_scan_that_nobody_wants_leaves_its_neighbours_alone(plan):
     tunnel, poses = Tunnel.from_plan(plan, "pockets"), poses_in(plan, 100)
     one = lambda *row: lidar.scan(tunnel, *row[:3], by_kernel(), row[3])  # noqa: E731
-    wanted = jnp.arange(100) % 3 == 0
-    some = np.asarray(jax.jit(jax.vmap(one))(*poses, wanted))
+    expected = jnp.arange(100) % 3 == 0
+    some = np.asarray(jax.jit(jax.vmap(one))(*poses, expected))
     np.testing.assert_array_equal(some[::3], scans(tunnel, poses, by_kernel)[::3])
 
 

@@ -1,4 +1,4 @@
-"""Tunnels of every kind of lining: what is drawn, what is told, which split has what, and the cut by the plane."""
+"""Tunnels of every kind of lining: what is drawn, what is reported, which split has what, and the cut by the plane."""
 
 import jax
 import jax.numpy as jnp

@@ -19,7 +19,7 @@ def arrays():
 
 
 @pytest.mark.parametrize(
-    ("field", "spoil"),
+    ("field", "corrupt"),
     [
         ("name", lambda a: None),
         ("provenance", lambda a: 3.0),
@@ -43,11 +43,11 @@ def arrays():
         ("left_pockets", lambda a: a.astype(str)),
     ],
 )
-def test_a_broken_field_is_named_together_with_its_file(tmp_path, arrays, field, spoil):
-    spoilt = spoil(arrays[field])
+def test_a_broken_field_is_named_together_with_its_file(tmp_path, arrays, field, corrupt):
+    corrupted = corrupt(arrays[field])
     arrays.pop(field)
-    if spoilt is not None:
-        arrays[field] = spoilt
+    if corrupted is not None:
+        arrays[field] = corrupted
     path = tunnels.write_tunnel(tmp_path / "broken.npz", arrays)
     with pytest.raises(st.TunnelError, match=rf"broken\.npz.*'{field}'"):
         st.load_tunnel(path)

@@ -308,7 +308,7 @@ class Constant(Trained):
         assert self.tensors["command"].shape == (2,)
 
     def check_task(self, env, params, source):
-        if env.rule.errand != "cover":
+        if env.rule.goal_kind != "cover":
             raise PolicyError(f"{source}: only drives on")
 
     def begin(self, key, obs, params):

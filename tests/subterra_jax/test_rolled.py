@@ -24,9 +24,9 @@ def test_every_triangle_is_delaunays_and_looks_inwards(name, window, monkeypatch
 
     monkeypatch.setattr(rolled, "_faces", searched)
     rolled.raise_shell(shell if window is None else shell.cut(*window), "built")
-    ((faces, wanted, u, s, girth),) = found
-    assert len(faces) == len(wanted) > 3000
-    assert as_set(faces) == as_set(wanted)
+    ((faces, expected, u, s, girth),) = found
+    assert len(faces) == len(expected) > 3000
+    assert as_set(faces) == as_set(expected)
     across, along = ((values[faces] - values[faces[:, :1]])[:, 1:] for values in (u, s))
     across = (across + girth / 2) % girth - girth / 2
     assert (across[:, 0] * along[:, 1] - across[:, 1] * along[:, 0] > 0.0).all()

@@ -162,8 +162,8 @@ def test_noise_grows_with_range_and_incidence_as_it_says():
     normal = jax.random.normal(jax.random.key(0), (n,))
     for metres, cosine, tangent in ((2.0, 1.0, 0.0), (60.0, np.cos(1.2), np.tan(1.2)), (5.0, 1e-4, 10.0)):
         seen = echo.add_noise(jnp.full(n, metres), jnp.full(n, cosine), normal, params)
-        wanted = np.sqrt(0.019**2 + (1e-4 * metres) ** 2 + (0.002 * tangent) ** 2)
-        assert np.std(np.asarray(seen) - metres) == pytest.approx(wanted, rel=0.02)
+        expected = np.sqrt(0.019**2 + (1e-4 * metres) ** 2 + (0.002 * tangent) ** 2)
+        assert np.std(np.asarray(seen) - metres) == pytest.approx(expected, rel=0.02)
 
 
 def test_weak_echoes_are_lost_by_range_incidence_and_material():

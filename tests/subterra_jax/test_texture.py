@@ -184,7 +184,7 @@ def test_scan_matching_finds_the_shift_by_brightness_alone():
     env, params = st.make(TASK, tunnel=straight(), intensity=True, texture=1.0)
     zero, settings = jnp.zeros(()), scanmatch.MatchParams()
 
-    def sight(x, key):
+    def sensing(x, key):
         state = placed(env, params, x)
         flat = env.observe(state, env.draw_step(jax.random.key(key), (), params), params)
         pose = scanmatch.AxisPose(jnp.float32(x), zero, zero, zero, jnp.float32(HALF))
@@ -194,11 +194,11 @@ def test_scan_matching_finds_the_shift_by_brightness_alone():
     faces, cost, plain = scanmatch.empty_profile(), 0.0, 0.0
     walls = scanmatch.empty_profile()
     for k in range(25):
-        pose, obs, face = sight(12.0 + 0.2 * k, k)
+        pose, obs, face = sensing(12.0 + 0.2 * k, k)
         faces = scanmatch.add_scan(faces, pose, obs.ranges, settings, face)
         walls = scanmatch.add_scan(walls, pose, obs.ranges, settings)
     for k in range(20):
-        pose, obs, face = sight(18.0 + 0.2 * k, 50 + k)
+        pose, obs, face = sensing(18.0 + 0.2 * k, 50 + k)
         off = dataclasses.replace(pose, station=pose.station + 0.1)
         cost = cost + scanmatch.mismatch(faces, off, obs.ranges, settings, face)
         plain = plain + scanmatch.mismatch(walls, off, obs.ranges, settings)

@@ -121,7 +121,7 @@ def tunnel_arrays(
         roughness: Standard deviation of the walls about their smooth curve, m.
         correlation: Length over which that roughness stays alike, m.
         wall_step: Distance between wall vertices, m.
-        centre_step: Wanted spacing of the chainage grid, m.
+        centre_step: Needed spacing of the chainage grid, m.
         seed: Seed of the roughness.
         name: Name in the file.
         transition: Length over which the curvature changes from piece to piece, m.

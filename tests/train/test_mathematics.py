@@ -61,8 +61,8 @@ def test_advantages_have_no_mean_and_unit_spread_over_all_parts():
 
 def test_the_auxiliary_loss_is_the_negative_log_likelihood_of_laplace():
     estimate, error = jnp.array([[1.0, 0.7], [2.0, -0.4]]), jnp.array([[1.5], [0.0]])
-    wanted = np.mean([0.5 * np.exp(-0.7) + 0.7, 2.0 * np.exp(0.4) - 0.4])
-    assert float(learning.auxiliary_loss(estimate, error)) == pytest.approx(wanted, rel=1e-6)
+    expected = np.mean([0.5 * np.exp(-0.7) + 0.7, 2.0 * np.exp(0.4) - 0.4])
+    assert float(learning.auxiliary_loss(estimate, error)) == pytest.approx(expected, rel=1e-6)
 
 
 def test_running_statistics_equal_those_of_all_the_data_at_once():

@@ -54,12 +54,12 @@ def test_a_gru_drives_without_the_trainer_as_it_does_with_it(gru):
 
     step = jax.jit(env.step)
     for i in range(5):
-        wanted, cell = think(kept, cell)
+        expected, cell = think(kept, cell)
         action, memory = act(memory, flat)
-        np.testing.assert_allclose(action[:2], wanted[0], atol=1e-5)
+        np.testing.assert_allclose(action[:2], expected[0], atol=1e-5)
         assert 0.0 < action[2] < params.tunnel.length
-        flat, state, *_ = step(jax.random.key(i), state, wanted[0], params)
-        kept = driver.take(policy, kept, wanted, Seen(flat[None], np.zeros(1, int)), params)
+        flat, state, *_ = step(jax.random.key(i), state, expected[0], params)
+        kept = driver.take(policy, kept, expected, Seen(flat[None], np.zeros(1, int)), params)
 
 
 def test_released_tensors_are_what_the_safetensors_library_reads(gru, released):

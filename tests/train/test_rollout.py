@@ -1,4 +1,4 @@
-"""An unroll of the trainer: answers, truncated episodes, rewards and what robots are told."""
+"""An unroll of the trainer: answers, truncated episodes, rewards and what robots are given."""
 
 import jax
 import numpy as np
@@ -93,10 +93,10 @@ def test_the_value_target_of_a_truncated_step_goes_on_with_its_final_observation
     rollout, scale = driven["rollout"], np.float32(2.0)
     batch = learner._batch(driven["policy"], driven["middle"], rollout, driven["after"], scale)
     cut = np.asarray(rollout.truncated)
-    wanted = np.asarray(rollout.reward / scale + CONFIG.discount * rollout.final_value)
+    expected = np.asarray(rollout.reward / scale + CONFIG.discount * rollout.final_value)
     assert cut.sum() == N_ENVS
     assert np.abs(np.asarray(rollout.final_value)[cut]).min() > 1e-3
-    np.testing.assert_allclose(np.asarray(batch.target)[cut], wanted[cut], atol=1e-5)
+    np.testing.assert_allclose(np.asarray(batch.target)[cut], expected[cut], atol=1e-5)
 
 
 def test_a_robot_is_told_the_length_of_its_own_tunnel_of_a_stack(tmp_path):

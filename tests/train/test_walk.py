@@ -48,10 +48,10 @@ def answer(driver, policy, seen):
 
 
 def records(n_steps=200, n_robots=4, speed=0.5, asked=0.6):
-    velocity, wanted = np.zeros((n_steps, n_robots, 3)), np.zeros((n_steps, n_robots, 3))
-    velocity[..., 0], wanted[..., 0] = speed, asked
+    velocity, expected = np.zeros((n_steps, n_robots, 3)), np.zeros((n_steps, n_robots, 3))
+    velocity[..., 0], expected[..., 0] = speed, asked
     flags = {name: np.zeros((n_steps, n_robots), bool) for name in ("fall", "over", "contact")}
-    return {"velocity": velocity, "asked": wanted, "effort": np.full((n_steps, n_robots), 300.0), **flags}
+    return {"velocity": velocity, "asked": expected, "effort": np.full((n_steps, n_robots), 300.0), **flags}
 
 
 def test_the_policy_does_not_see_the_truth_and_the_critic_does(driver, policy):
@@ -66,8 +66,8 @@ def test_a_released_gait_acts_as_the_one_that_was_trained(driver, policy, tmp_pa
     write_tensors(out, driver.kind, driver.layout, driver.tensors(policy), {"task": "Subterra/B2Walk-v1", "world": {}})
     loaded, facts = gaits.load_policy(out)
     seen = jax.random.normal(jax.random.key(3), (5, N_SEEN + N_TRUTH))
-    wanted = driver.action(answer(driver, policy, seen).mean)
-    np.testing.assert_allclose(loaded.act(seen[:, :N_SEEN]), wanted, atol=1e-6)
+    expected = driver.action(answer(driver, policy, seen).mean)
+    np.testing.assert_allclose(loaded.act(seen[:, :N_SEEN]), expected, atol=1e-6)
     assert facts["kind"] == "walk"
     assert loaded.n_observation == N_SEEN
     gaits.check_fits(loaded, N_SEEN, out)

@@ -19,7 +19,7 @@ from train.world import open_world as open_planar_world
 B2 = "b2"
 ON_LEGS = "legs.json"  # what came of the trial, in the run folder
 TASKS = ("Subterra/Traverse-v1", "Subterra/TraverseShort-v1")
-# A gait is no motor: it walks a tenth faster or slower than told, and a little askew.
+# A gait is no motor: it walks a tenth faster or slower than reported, and a little askew.
 _SLIP = SlipParams(gain_sigma=0.1, yaw_sigma=0.02)
 
 

@@ -54,14 +54,14 @@ def climb_ladders(case: Case, kinds: tuple[str, ...], places: int, draw: int, fo
     key = sha256(f"{case_hash(case)} {draw}".encode()).hexdigest()
     path = folder / "ladder.json"
     done = {(row["kind"], row["number"]): row for row in read_kept(path, SCHEMA, key).get("rows", [])}
-    wanted = [(kind, number) for number in range(places) for kind in kinds]
+    needed = [(kind, number) for number in range(places) for kind in kinds]
     site = local_site(case)
     before = worst_windows(case)
     with Stages() as progress:
-        stage = progress.start("places", len(wanted))
-        if known := sum(one in done for one in wanted):
+        stage = progress.start("places", len(needed))
+        if known := sum(one in done for one in needed):
             stage.resume(known)
-        for kind, number in wanted:
+        for kind, number in needed:
             if (kind, number) in done:
                 continue
             known_rungs = [row["rung"] for row in done.values() if row["kind"] == kind]
@@ -71,7 +71,7 @@ def climb_ladders(case: Case, kinds: tuple[str, ...], places: int, draw: int, fo
             write_json(path, {"schema": SCHEMA, "key": key, "rows": list(done.values())})
             release_memory()
             stage.advance()
-    return [done[one] for one in wanted]
+    return [done[one] for one in needed]
 
 
 def _climb(site: Site, before: list[Worst], fault: Fault, guess: int = -1) -> dict[str, Any]:

@@ -117,10 +117,10 @@ def run_control(bench: Bench, job: Job) -> Outcome:
     control = kinds.load_controls()[job.control]
     with tempfile.TemporaryDirectory() as scratch:
         site = Site(replace(bench.case, cache={}), rng, Path(scratch), partial(_foreign_candidate, bench))
-        spoiled = put_in(site, control.faults[job.dose])
-        values = bench.compute(spoiled, _evaluated_categories(control.evaluated), bench.base)
+        corrupted = put_in(site, control.faults[job.dose])
+        values = bench.compute(corrupted, _evaluated_categories(control.evaluated), bench.base)
         recorded = None if bench.case.hold is None else bench.case.hold.hash
-        return Outcome(job, values, find_leaks(spoiled, values, recorded))
+        return Outcome(job, values, find_leaks(corrupted, values, recorded))
 
 
 def without_figures(reasons: list[str]) -> set[str]:

@@ -270,7 +270,9 @@ def draw_all(folder: Path, sheet: Sheet) -> dict[str, tuple[Path, str]]:
                 continue
             try:
                 drawn = draw(sheet)
-            except Exception as error:  # a recording that shows too little, or a spoilt candidate, costs its own figure
+            except (
+                Exception
+            ) as error:  # a recording that shows too little, or a corrupted candidate, costs its own figure
                 print(f"{name} is left out: {error}", flush=True)
                 plt.close("all")
                 continue

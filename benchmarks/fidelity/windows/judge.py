@@ -65,7 +65,7 @@ def _worst(case: Case, one: measures.Measure, source: measures.Source) -> Worst:
     nothing = replace(nothing, limit=limit, foreign="" if sensor else topic)
     try:
         series = one.compute(case, source)
-    except Exception as error:  # a spoilt candidate may break any library
+    except Exception as error:  # a corrupted candidate may break any library
         return replace(nothing, error=f"{type(error).__name__}: {error}"[:200])
     if not np.isfinite(series.value).any():
         return nothing
@@ -111,10 +111,10 @@ def notice_faults(case: Case, before: list[Worst]) -> list[Noticed]:
     return result
 
 
-def noticed_by(spoilt: Case, before: list[Worst]) -> tuple[str, ...]:
-    """Return the windows that are beyond their limits in a spoilt case and were not before, `id.source`."""
+def noticed_by(corrupted: Case, before: list[Worst]) -> tuple[str, ...]:
+    """Return the windows that are beyond their limits in a corrupted case and were not before, `id.source`."""
     known = {(one.id, one.source) for one in before if one.beyond}
-    after = worst_windows(spoilt)
+    after = worst_windows(corrupted)
     return tuple(f"{one.id}.{one.source}" for one in after if one.beyond and (one.id, one.source) not in known)
 
 

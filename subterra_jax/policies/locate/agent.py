@@ -22,7 +22,7 @@ from subterra_jax.state import EnvParams
 from subterra_jax.tunnel_env import TunnelEnv
 
 KIND = "locate"
-ERRANDS = ("stop", "return")
+GOAL_KINDS = ("stop", "return")
 
 
 @struct.dataclass
@@ -32,7 +32,7 @@ class Locating(Trained):
     kind: ClassVar[str] = KIND
     prefix: ClassVar[str] = ""
     uses_lidar = True
-    learns_errand: ClassVar[bool] = False
+    learns_goal_kind: ClassVar[bool] = False
     tensors: Tensors  # weights by name, parts of the name between dots
     low: Float[Array, "2"]  # smallest action, m/s and rad/s
     high: Float[Array, "2"]  # largest action, m/s and rad/s
@@ -56,8 +56,10 @@ class Locating(Trained):
 
     def check_task(self, env: TunnelEnv, params: EnvParams, source: str | Path) -> None:
         """Refuses a task without a goal on the way, and beams that are no multiple of 16."""
-        if (errand := env.rule.errand) not in ERRANDS:
-            raise PolicyError(f"{source}: a localiser on its way to a goal, without a map; {env.id} asks to {errand}")
+        if (goal_kind := env.rule.goal_kind) not in GOAL_KINDS:
+            raise PolicyError(
+                f"{source}: a localiser on its way to a goal, without a map; {env.id} asks to {goal_kind}"
+            )
         if (n := n_ranges(params)) % 16:
             raise PolicyError(f"{source}: needs 16 level beams or a multiple of them, {env.id} has {n}")
 

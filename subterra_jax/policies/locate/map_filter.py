@@ -38,7 +38,7 @@ _CHANNELS = 6
 _UNIT = 0.03  # m: relief that is large against noise
 _ROOF = 3.0  # of a feature: deeper niches count as so deep
 _MOST = 8.0  # log odds of the map at most
-_LEAST_SIGMA = 0.12  # m; a start that is told exactly
+_LEAST_SIGMA = 0.12  # m; a start that is reported exactly
 _WINDOW = 3  # cells to either side that count as one place
 _FLOOR = 1e-7  # of the probability of a cell, in the loss
 _TO_MEAN_ABSOLUTE = float(np.sqrt(2.0 / np.pi))
@@ -76,7 +76,7 @@ def _in_middle(taps: list[float]) -> Float[Array, "tap"]:
 
 
 def start(weights: Weights, sigma: Float[Array, ""]) -> MapBelief:
-    """Returns the belief at the start, whose station is told with a standard deviation (m)."""
+    """Returns the belief at the start, whose station is reported with a standard deviation (m)."""
     width = jnp.maximum(sigma, _LEAST_SIGMA)
     return MapBelief(jax.nn.softmax(-0.5 * (jnp.asarray(SHIFTS) / width) ** 2), weights["log_odds"])
 
@@ -213,7 +213,7 @@ def corrected(now: MapBelief, plain: Estimate, age: Float[Array, ""], start_sigm
         now: The belief, `DELAY` metres ago.
         plain: Estimate without a map.
         age: Metres so far.
-        start_sigma: Standard deviation of the station told as the start, m.
+        start_sigma: Standard deviation of the station reported as the start, m.
     """
     shift, sigma, believed = place(now)
     believed &= age > DELAY
@@ -240,7 +240,7 @@ def metre(
         weights: Trained weights, as `init` makes them.
         profiles: `N_SEEN` bins about the block.
         strip: The map of the tunnel.
-        told: Station told as the start, m.
+        told: Station reported as the start, m.
         block: Number of the block.
         passed: Correction at its end, by the localiser alone, m.
         error: Correction in it, m.
@@ -271,7 +271,7 @@ def sequence(
         whole: Profiles of the drive.
         before: Bins of them before the start; at least `MARGIN`.
         strip: The map of the tunnel.
-        told: Station told as the start, m.
+        told: Station reported as the start, m.
         sigma: Its standard deviation, m.
         passed: Correction at the end of the block `DELAY` metres before each metre, by the localiser alone, m.
         log_rate: Log of the rate at which the localiser says that its error grows, at each metre.

@@ -58,8 +58,8 @@ def _find_strips(
     angle = azimuth[column] + walls.angle
     sine = jnp.abs(jnp.sin(angle))
     height = jnp.asarray(HEIGHTS)[:, None, None, None]
-    wanted = jnp.arctan(height * sine / jnp.maximum(wall, 0.5))
-    ring = jnp.argmin(jnp.abs(wanted[..., None] - elevation), axis=-1)
+    needed = jnp.arctan(height * sine / jnp.maximum(wall, 0.5))
+    ring = jnp.argmin(jnp.abs(needed[..., None] - elevation), axis=-1)
     reach = image[ring, column]
     level = reach * jnp.cos(elevation[ring])
     along, out = level * jnp.cos(angle), level * sine - wall

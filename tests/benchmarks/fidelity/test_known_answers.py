@@ -1,4 +1,4 @@
-"""Metrics whose value on a tube of known dimensions is known, and what spoils them."""
+"""Metrics whose value on a tube of known dimensions is known, and what corrupts them."""
 
 from dataclasses import replace
 from functools import partial
@@ -24,7 +24,7 @@ def test_a_pillar_is_a_loop_that_the_other_diagram_has_not() -> None:
     turn[:3, 3] = SHORT.point(6.1, 0.0, 0.0)[0]
     pillar = trimesh.creation.box((0.4, 0.4, 8.0), transform=turn)
     assert raw("topo_bottleneck_h1", short()) == pytest.approx(0.0, abs=1e-9)
-    assert raw("topo_bottleneck_h1", tube.spoiled(short(), extra=pillar)) > 0.3
+    assert raw("topo_bottleneck_h1", tube.corrupted(short(), extra=pillar)) > 0.3
 
 
 def test_rails_10_cm_farther_out_give_the_footprint_10_cm_more_room() -> None:
@@ -40,7 +40,7 @@ def test_a_floor_with_steps_everywhere_has_another_95th_percentile() -> None:
     blocks = [trimesh.creation.box((0.15, 6.0, 0.12)) for _ in range(12)]
     for k, block in enumerate(blocks):
         block.apply_translation(SHORT.point(0.7 + 0.9 * k, 0.0, float(SHORT.floor(0.7 + 0.9 * k)) + 0.1)[0])
-    rough = tube.spoiled(short(track=False), extra=trimesh.util.concatenate(blocks))
+    rough = tube.corrupted(short(track=False), extra=trimesh.util.concatenate(blocks))
     assert raw("nav_step_p95_err", rough) > 0.02
 
 
@@ -50,7 +50,7 @@ def test_nails_are_counted_by_pairs_of_pockets_on_either_side_of_a_joint() -> No
     joints = np.sum((SHORT.joints > 0.4) & (SHORT.joints < SHORT.length - 0.4))
     assert value.n == 6 * joints
     assert value.value == 0.0
-    nailed = tube.spoiled(case, manifest={**case.candidate.manifest, "count": {"nails": 3 * int(joints)}})
+    nailed = tube.corrupted(case, manifest={**case.candidate.manifest, "count": {"nails": 3 * int(joints)}})
     assert raw("lin_nail_count_ratio", nailed) == pytest.approx(0.5)
 
 
@@ -60,7 +60,7 @@ def test_a_rail_that_rises_2_mm_a_metre_over_the_other_is_that_much_twist() -> N
     assert raw("trk_twist_p95", case) < 0.05
     left = track.rail["left"].copy()
     left[:, 2] += 0.002 * np.linalg.norm(left - left[0], axis=1)
-    twisted = tube.spoiled(case, track=replace(track, rail={**track.rail, "left": left}))
+    twisted = tube.corrupted(case, track=replace(track, rail={**track.rail, "left": left}))
     assert raw("trk_twist_p95", twisted) == pytest.approx(2.0, abs=0.1)
 
 

@@ -216,13 +216,13 @@ def test_on_a_survey_made_anew_every_fault_moves_its_metrics(tmp_path: Path) -> 
     assert sum(full) < 0.7 * len(full)  # the scale is not used up by a good reconstruction
     still = []
     for number, (fault, ids) in enumerate(MOVES.items()):
-        spoilt = put_in(Site(case, scratch=tmp_path / str(number)), fault)
+        corrupted = put_in(Site(case, scratch=tmp_path / str(number)), fault)
         for id in ids.split():
-            after = measure(id, spoilt)
+            after = measure(id, corrupted)
             cost = scoring.score_one(rows[id], before[id]).score - scoring.score_one(rows[id], after).score
             if before[id].value == after.value or cost < LEAST:
                 still.append((id, fault, before[id].value, after.value, cost))
-        spoilt.cache.clear()
+        corrupted.cache.clear()
     assert still == []
 
 

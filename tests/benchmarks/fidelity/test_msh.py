@@ -17,8 +17,8 @@ def good():
     return tube.case(SHORT)
 
 
-def spoiled(**changes):
-    return tube.spoiled(good(), **changes)
+def corrupted(**changes):
+    return tube.corrupted(good(), **changes)
 
 
 def remade(mesh, faces):
@@ -27,7 +27,7 @@ def remade(mesh, faces):
 
 def both(change):
     judged = good().candidate
-    return spoiled(lining=change(judged.lining), solid=change(judged.solid))
+    return corrupted(lining=change(judged.lining), solid=change(judged.solid))
 
 
 PASSING = [
@@ -58,21 +58,21 @@ def test_a_tenth_of_the_faces_turned_breaks_winding_and_costs_a_tenth_of_the_are
     turned = np.random.default_rng(1).random(len(good().candidate.lining.faces)) < 0.1
     flip = good().candidate.lining.faces.copy()
     flip[turned] = flip[turned][:, ::-1]
-    case = spoiled(lining=remade(good().candidate.lining, flip))
+    case = corrupted(lining=remade(good().candidate.lining, flip))
     assert measure("mesh_winding_consistent", case).value == 0.0
     assert measure("mesh_orientation_frac", case).value == pytest.approx(0.9, abs=0.02)
 
 
 def test_repeated_faces_are_counted():
     lining = good().candidate.lining
-    case = spoiled(lining=remade(lining, np.concatenate([lining.faces, lining.faces[:50, [1, 0, 2]]])))
+    case = corrupted(lining=remade(lining, np.concatenate([lining.faces, lining.faces[:50, [1, 0, 2]]])))
     assert measure("mesh_duplicate_faces", case).value == pytest.approx(50 / (len(lining.faces) + 50))
     assert measure("mesh_nonmanifold_edges", case).value > 0.0
 
 
 def test_a_needle_is_degenerate():
     lining = good().candidate.lining
-    case = spoiled(lining=remade(lining, np.concatenate([lining.faces, [[3, 3, 9]]])))
+    case = corrupted(lining=remade(lining, np.concatenate([lining.faces, [[3, 3, 9]]])))
     assert measure("mesh_degenerate_faces", case).value == pytest.approx(1 / (len(lining.faces) + 1))
 
 
@@ -82,21 +82,21 @@ def test_a_fin_through_the_wall_cuts_it():
     fin = np.array([inside, outside, inside])
     fin[2, 2] += 0.3
     faces = np.concatenate([lining.faces, [len(lining.vertices) + np.arange(3)]])
-    case = spoiled(lining=trimesh.Trimesh(np.concatenate([lining.vertices, fin]), faces, process=False))
+    case = corrupted(lining=trimesh.Trimesh(np.concatenate([lining.vertices, fin]), faces, process=False))
     assert measure("mesh_self_intersections", case).value >= 2 / len(faces)
 
 
 def test_a_vertex_that_is_no_number_fails():
     lining = good().candidate.lining.copy()
     lining.vertices[5, 1] = np.nan
-    assert measure("mesh_finite", spoiled(lining=lining)).value == 0.0
+    assert measure("mesh_finite", corrupted(lining=lining)).value == 0.0
 
 
 def test_the_volume_is_that_of_the_sections_and_a_scaled_solid_is_off_by_its_cube():
     assert measure("mesh_volume_vs_sections", good()).value < 0.2
     solid = good().candidate.solid.copy()
     solid.apply_scale(1.05)
-    assert measure("mesh_volume_vs_sections", spoiled(solid=solid)).value == pytest.approx(
+    assert measure("mesh_volume_vs_sections", corrupted(solid=solid)).value == pytest.approx(
         100 * (1 - 1.05**-3), abs=0.2
     )
 

@@ -132,8 +132,8 @@ def test_a_fault_of_a_file_is_a_control_and_a_ladder_beside_the_suite(tmp_path: 
     assert asked_faults()["dent"].size == 0.1
     case = tube.case(tube.Tube(length=12.0), beams=500)
 
-    def compute(spoilt, categories, reuse):
-        moved = np.abs(spoilt.candidate.lining.vertices - case.candidate.lining.vertices).max()
+    def compute(corrupted, categories, reuse):
+        moved = np.abs(corrupted.candidate.lining.vertices - case.candidate.lining.vertices).max()
         return reuse | {id: Value(1.0) for id, row in table.load().items() if row.category == "C2M" and moved > 0.02}
 
     good = {id: Value(1.0 if row.map.kind == "P" else row.map.target if row.map.kind == "B" else row.map.good)

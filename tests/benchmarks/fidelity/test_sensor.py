@@ -78,7 +78,7 @@ def _wall(station):
 
 
 def test_the_papers_own_figure_cannot_tell_a_wrong_tube_and_is_not_scored():
-    right, wrong = (raw("selfcast_p2s_mean", judged(**spoilt)) for spoilt in ({}, {"width": 6.2, "height": 7.0}))
+    right, wrong = (raw("selfcast_p2s_mean", judged(**corrupted)) for corrupted in ({}, {"width": 6.2, "height": 7.0}))
     assert wrong == pytest.approx(right, rel=0.1)
     assert raw("selfcast_noise_ratio", judged(width=6.2)) == pytest.approx(1.0, abs=0.1)
     assert not any(metric.scored for id, metric in table.load().items() if id.startswith("selfcast"))

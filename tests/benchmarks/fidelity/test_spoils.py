@@ -21,12 +21,12 @@ def base() -> Case:
     return tube.case()
 
 
-def spoil(case: Case, control: str, dose: float, scratch: Path = Path("unused")) -> Case:
+def corrupt(case: Case, control: str, dose: float, scratch: Path = Path("unused")) -> Case:
     return put_in(Site(case, scratch=scratch, foreign=lambda: case.candidate), load_controls()[control].faults[dose])
 
 
 def candidate(case: Case, control: str, dose: float) -> Candidate:
-    return spoil(case, control, dose).candidate
+    return corrupt(case, control, dose).candidate
 
 
 def test_the_table_has_36_controls_and_7_invariances_and_each_has_a_function() -> None:
@@ -42,34 +42,34 @@ def test_the_table_has_36_controls_and_7_invariances_and_each_has_a_function() -
 @pytest.mark.parametrize("control", NO_SCENE)
 def test_a_control_changes_something_and_leaves_the_base_alone(base: Case, control: str) -> None:
     before = base.candidate.lining.vertices.copy(), base.candidate.solid.faces.copy(), base.hold.origin.copy()
-    spoilt = spoil(base, control, load_controls()[control].bold[0])
+    corrupted = corrupt(base, control, load_controls()[control].bold[0])
     np.testing.assert_array_equal(before[0], base.candidate.lining.vertices)
     np.testing.assert_array_equal(before[1], base.candidate.solid.faces)
     np.testing.assert_array_equal(before[2], base.hold.origin)
-    assert spoilt.candidate is not base.candidate or spoilt.hold is not base.hold
-    assert not spoilt.cache
-    again = spoil(base, control, load_controls()[control].bold[0])  # the same bytes
-    np.testing.assert_array_equal(spoilt.candidate.lining.vertices, again.candidate.lining.vertices)
-    np.testing.assert_array_equal(spoilt.hold.range, again.hold.range)
+    assert corrupted.candidate is not base.candidate or corrupted.hold is not base.hold
+    assert not corrupted.cache
+    again = corrupt(base, control, load_controls()[control].bold[0])  # the same bytes
+    np.testing.assert_array_equal(corrupted.candidate.lining.vertices, again.candidate.lining.vertices)
+    np.testing.assert_array_equal(corrupted.hold.range, again.hold.range)
 
 
 def test_a_section_scaled_by_5_percent_is_5_percent_larger_all_round(base: Case) -> None:
-    spoilt = candidate(base, "N02", 5)
-    assert spoilt.bore.width == pytest.approx(1.05 * base.candidate.bore.width, rel=1e-3)
-    assert spoilt.solid.volume == pytest.approx(1.05**2 * base.candidate.solid.volume, rel=2e-3)
-    assert spoilt.length == pytest.approx(base.candidate.length, rel=1e-4)
+    corrupted = candidate(base, "N02", 5)
+    assert corrupted.bore.width == pytest.approx(1.05 * base.candidate.bore.width, rel=1e-3)
+    assert corrupted.solid.volume == pytest.approx(1.05**2 * base.candidate.solid.volume, rel=2e-3)
+    assert corrupted.length == pytest.approx(base.candidate.length, rel=1e-4)
 
 
 def test_width_alone_leaves_the_height(base: Case) -> None:
-    spoilt = candidate(base, "N03", 5)
-    assert spoilt.bore.width == pytest.approx(1.05 * base.candidate.bore.width, rel=1e-3)
-    assert spoilt.bore.height == pytest.approx(base.candidate.bore.height, rel=1e-3)
+    corrupted = candidate(base, "N03", 5)
+    assert corrupted.bore.width == pytest.approx(1.05 * base.candidate.bore.width, rel=1e-3)
+    assert corrupted.bore.height == pytest.approx(base.candidate.bore.height, rel=1e-3)
 
 
 def test_an_axial_stretch_moves_mesh_and_recording_together(base: Case) -> None:
-    spoilt = spoil(base, "N04", 5)
-    assert spoilt.candidate.length == pytest.approx(1.05 * base.candidate.length, rel=1e-3)
-    near = trimesh.proximity.closest_point(spoilt.candidate.lining, spoilt.hold.points[::400])[1]
+    corrupted = corrupt(base, "N04", 5)
+    assert corrupted.candidate.length == pytest.approx(1.05 * base.candidate.length, rel=1e-3)
+    near = trimesh.proximity.closest_point(corrupted.candidate.lining, corrupted.hold.points[::400])[1]
     before = trimesh.proximity.closest_point(base.candidate.lining, base.hold.points[::400])[1]
     assert np.median(near) < 1.5 * np.median(before)
 
@@ -88,19 +88,19 @@ def test_a_raised_floor_leaves_the_crown(base: Case) -> None:
 
 
 def test_what_is_shortened_by_10_percent_stays_watertight(base: Case) -> None:
-    spoilt = candidate(base, "N09", 10)
-    assert spoilt.length == pytest.approx(0.9 * base.candidate.length, abs=0.3)
-    assert spoilt.solid.is_watertight
-    assert len(spoilt.track.sleeper) < len(base.candidate.track.sleeper)
+    corrupted = candidate(base, "N09", 10)
+    assert corrupted.length == pytest.approx(0.9 * base.candidate.length, abs=0.3)
+    assert corrupted.solid.is_watertight
+    assert len(corrupted.track.sleeper) < len(base.candidate.track.sleeper)
 
 
 def test_a_straightened_axis_has_no_curvature_and_its_length(base: Case) -> None:
     curved = tube.case(tube.Tube(bend=60.0))
-    spoilt = candidate(curved, "N10", 100)
-    position = spoilt.bore.position
+    corrupted = candidate(curved, "N10", 100)
+    position = corrupted.bore.position
     chord = np.linalg.norm(position[-1] - position[0])
-    assert chord == pytest.approx(spoilt.length, rel=1e-4)
-    assert spoilt.length == pytest.approx(curved.candidate.length, rel=1e-3)
+    assert chord == pytest.approx(corrupted.length, rel=1e-4)
+    assert corrupted.length == pytest.approx(curved.candidate.length, rel=1e-3)
 
 
 def test_flipped_normals_turn_the_volume_negative(base: Case) -> None:
@@ -131,10 +131,10 @@ def test_rails_take_their_new_gauge(base: Case) -> None:
 
 
 def test_removed_pockets_leave_a_smooth_wall_of_less_volume(base: Case) -> None:
-    spoilt, pocket = candidate(base, "N25", 100), base.candidate.bore.pocket
-    taken = base.candidate.solid.volume - spoilt.solid.volume
+    corrupted, pocket = candidate(base, "N25", 100), base.candidate.bore.pocket
+    taken = base.candidate.solid.volume - corrupted.solid.volume
     assert taken == pytest.approx(float((pocket["length"] * pocket["width"] * pocket["depth"]).sum()), rel=0.35)
-    assert len(spoilt.bore.pocket) == 0
+    assert len(corrupted.bore.pocket) == 0
 
 
 def test_a_wall_cuts_the_air_in_two(base: Case) -> None:
@@ -161,16 +161,16 @@ def test_a_closed_mouth_has_one_rim_less(base: Case) -> None:
 
 
 def test_permuted_poses_keep_every_beam(base: Case) -> None:
-    spoilt = spoil(base, "N32", 2).hold
-    np.testing.assert_array_equal(spoilt.range, base.hold.range)
-    assert np.median(np.linalg.norm(spoilt.origin - base.hold.origin, axis=1)) > 1.0
+    corrupted = corrupt(base, "N32", 2).hold
+    np.testing.assert_array_equal(corrupted.range, base.hold.range)
+    assert np.median(np.linalg.norm(corrupted.origin - base.hold.origin, axis=1)) > 1.0
 
 
 def test_a_foreign_tunnel_is_brought_to_our_mouth(base: Case) -> None:
     other = tube.candidate(tube.Tube(heading=1.0, bend=70.0))
-    spoilt = put_in(Site(base, foreign=lambda: other), load_controls()["N33"].faults[1.0])
-    assert spoilt.truth.position[0] == pytest.approx(other.bore.position[0], abs=0.2)
-    flat = spoilt.truth.tangent[0, :2] @ other.bore.tangent[0, :2]
+    corrupted = put_in(Site(base, foreign=lambda: other), load_controls()["N33"].faults[1.0])
+    assert corrupted.truth.position[0] == pytest.approx(other.bore.position[0], abs=0.2)
+    flat = corrupted.truth.tangent[0, :2] @ other.bore.tangent[0, :2]
     assert flat == pytest.approx(1.0, abs=2e-3)
 
 
@@ -181,7 +181,7 @@ def test_nails_are_seen_move_with_the_pattern_and_go_with_their_pockets(base: Ca
     away = np.cos(one["angle"]) * bore.lateral[row] + np.sin(one["angle"]) * bore.up[row]
     nail = trimesh.creation.icosphere(subdivisions=0, radius=0.02)
     nail.apply_translation(bore.position[row] + 2.7 * away)
-    nailed = tube.spoiled(base, nails=nail)
+    nailed = tube.corrupted(base, nails=nail)
     assert len(visible_mesh(nailed.candidate).faces) == len(visible_mesh(base.candidate).faces) + len(nail.faces)
     assert not len(candidate(nailed, "N25", 100).nails.faces)
     assert len(candidate(nailed, "N26", 2).nails.faces) == len(nail.faces)

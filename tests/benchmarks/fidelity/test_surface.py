@@ -106,7 +106,7 @@ def test_an_obstacle_is_a_mismatch_in_the_interior():
     assert raw("vox_f1_tol1", obstructed()) < raw("vox_f1_tol1", judged())
 
 
-def test_poses_in_a_wrong_order_leave_the_path_and_spoil_the_agreement():
+def test_poses_in_a_wrong_order_leave_the_path_and_corrupt_the_agreement():
     hold = judged().hold
     number = np.unique(hold.scan)
     swapped = dict(zip(number, np.roll(number, len(number) // 2), strict=True))

@@ -36,18 +36,18 @@ BLOB = placed((0.5, 0.5, 0.5), 0.4, 0.4)
 
 
 def test_a_wall_across_cuts_it_in_two():
-    case = tube.spoiled(good(), extra=WALL)
+    case = tube.corrupted(good(), extra=WALL)
     assert measure("topo_free_b0", case).value == 2
     assert measure("topo_body_count_err", case).value == 1
 
 
 def test_a_pillar_from_floor_to_crown_makes_a_loop():
-    assert measure("topo_free_b1_err", tube.spoiled(good(), extra=PILLAR)).value == 1
-    assert measure("topo_free_b2_err", tube.spoiled(good(), extra=PILLAR)).value == 0
+    assert measure("topo_free_b1_err", tube.corrupted(good(), extra=PILLAR)).value == 1
+    assert measure("topo_free_b2_err", tube.corrupted(good(), extra=PILLAR)).value == 0
 
 
 def test_a_body_in_the_air_makes_a_void_and_is_loose_area():
-    case = tube.spoiled(good(), extra=BLOB)
+    case = tube.corrupted(good(), extra=BLOB)
     assert measure("topo_free_b2_err", case).value == 1
     assert measure("topo_floater_area", case).value == pytest.approx(
         1.5 / (1.5 + good().candidate.lining.area), rel=1e-6
@@ -57,7 +57,7 @@ def test_a_body_in_the_air_makes_a_void_and_is_loose_area():
 def test_held_out_returns_show_the_pillar_too():
     known = replace(heard(), truth=None)
     assert measure("topo_free_b1_err", known).value == 0
-    assert measure("topo_free_b1_err", tube.spoiled(known, extra=PILLAR)).value == 1
+    assert measure("topo_free_b1_err", tube.corrupted(known, extra=PILLAR)).value == 1
 
 
 def test_a_narrower_bore_moves_the_diagram_by_what_it_is_narrower():
@@ -68,14 +68,14 @@ def test_a_hole_leaks_by_its_solid_angle_and_is_a_third_rim():
     lining = good().candidate.lining
     local = lining.triangles_center - SHORT.point(MIDDLE, 0.0, 3.3)[0]
     hole = np.linalg.norm(local, axis=1) < 0.8
-    case = tube.spoiled(good(), lining=trimesh.Trimesh(lining.vertices, lining.faces[~hole], process=False))
+    case = tube.corrupted(good(), lining=trimesh.Trimesh(lining.vertices, lining.faces[~hole], process=False))
     assert measure("topo_mouth_err", case).value == 1
     assert measure("topo_leak_frac", case).value == pytest.approx(lining.area_faces[hole].sum() / lining.area, rel=0.5)
 
 
 def test_a_handle_is_counted():
     ring = trimesh.creation.torus(1.0, 0.2)
-    case = tube.spoiled(good(), solid=ring)
+    case = tube.corrupted(good(), solid=ring)
     assert measure("topo_genus", case).value == 1
     assert measure("topo_chi_err", case).value == 2
 

@@ -20,7 +20,7 @@ def good():
 
 def with_lining(vertices, faces=None):
     faces = good().candidate.lining.faces if faces is None else faces
-    return tube.spoiled(good(), lining=trimesh.Trimesh(vertices, faces, process=False))
+    return tube.corrupted(good(), lining=trimesh.Trimesh(vertices, faces, process=False))
 
 
 def sheet(step, skew=1.0):

@@ -23,7 +23,7 @@ def test_jitter_shows_in_the_standard_deviation():
     case = judged()
     moved = case.candidate.track.sleeper.copy()
     moved += np.random.default_rng(0).normal(scale=0.02, size=(len(moved), 1)) * SHORT.frames(5.0)[1]
-    shaken = tube.spoiled(case, track=replace(case.candidate.track, sleeper=moved))
+    shaken = tube.corrupted(case, track=replace(case.candidate.track, sleeper=moved))
     assert measure("trk_sleeper_spacing_std_err", shaken).value == pytest.approx(0.02 * np.sqrt(2), rel=0.5)
 
 
@@ -31,7 +31,7 @@ def test_a_missing_third_of_the_sleepers_costs_recall():
     case = judged()
     fewer = replace(case.candidate.track, sleeper=case.candidate.track.sleeper[np.arange(20) % 3 != 0])
     kept = len(fewer.sleeper)
-    assert measure("trk_sleeper_f1", tube.spoiled(case, track=fewer)).value == pytest.approx(2 * kept / (kept + 20))
+    assert measure("trk_sleeper_f1", tube.corrupted(case, track=fewer)).value == pytest.approx(2 * kept / (kept + 20))
 
 
 def test_a_missing_length_of_rail_is_the_gap():
@@ -42,7 +42,7 @@ def test_a_missing_length_of_rail_is_the_gap():
     holed = track.rail_mesh.copy()
     holed.update_faces(part != 4)
     assert measure(
-        "trk_rail_gap_max", tube.spoiled(case, track=replace(track, rail_mesh=holed))
+        "trk_rail_gap_max", tube.corrupted(case, track=replace(track, rail_mesh=holed))
     ).value == pytest.approx(length, abs=0.01)
 
 
@@ -51,21 +51,21 @@ def test_a_lifted_rail_floats_over_its_pads():
     lifted = case.candidate.track.rail_mesh.copy()
     lifted.apply_translation([0.0, 0.0, 0.04])
     before = measure("trk_asset_penetration_max", case).value
-    case = tube.spoiled(case, track=replace(case.candidate.track, rail_mesh=lifted))
+    case = tube.corrupted(case, track=replace(case.candidate.track, rail_mesh=lifted))
     assert measure("trk_asset_penetration_max", case).value == pytest.approx(0.04 + before, abs=0.01)
 
 
 def test_a_narrow_bore_does_not_hold_its_sleepers():
     case = judged()
     bore = replace(case.candidate.bore, radius=case.candidate.bore.radius * 0.43)
-    assert measure("trk_sleeper_in_bore", tube.spoiled(case, bore=bore)).value == 0.0
+    assert measure("trk_sleeper_in_bore", tube.corrupted(case, bore=bore)).value == 0.0
 
 
 def test_missing_pads_lower_the_ratio():
     case = judged()
     fewer = case.candidate.track.fastening_mesh.copy()
     fewer.update_faces(np.arange(len(fewer.faces)) >= 12 * 4)
-    case = tube.spoiled(case, track=replace(case.candidate.track, fastening_mesh=fewer))
+    case = tube.corrupted(case, track=replace(case.candidate.track, fastening_mesh=fewer))
     assert measure("trk_fastener_ratio", case).value == pytest.approx(36 / 40)
 
 

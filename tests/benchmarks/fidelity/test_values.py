@@ -30,7 +30,7 @@ IN_MEMORY = [id for id, row in table.load().items() if row.category not in ("SCN
 
 
 @cache
-def spoilt(told: bool) -> Case:
+def corrupted(told: bool) -> Case:
     beams = 1500 if told else 6000  # so many show sections and ground by themselves
     case = tube.case(RIGHT, replace(RIGHT, width=5.62, depth=0.11), beams=beams)
     fit = tube.hold(RIGHT, beams=300, seed=1)
@@ -43,9 +43,9 @@ def values(told: bool) -> dict[str, tuple[float | None, float | None, int]]:
     """Value, upper end of its interval and number of samples by metric; value and place of the worst windows."""
     found = {}
     for id in IN_MEMORY:
-        one = measure(id, spoilt(told))
+        one = measure(id, corrupted(told))
         found[id] = one.value, one.interval[1] if one.interval else None, one.n
-    for one in map(asdict, worst_windows(spoilt(told))):
+    for one in map(asdict, worst_windows(corrupted(told))):
         found[f"window {one['id']} {one['source']}"] = one["value"], one["start"], round(1e3 * one["judged"])
     return found
 

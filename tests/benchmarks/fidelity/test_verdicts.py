@@ -89,8 +89,8 @@ def test_a_fall_to_the_cap_of_a_gate_that_newly_fails_is_deep_enough_and_no_othe
     assert row["categories"]["PAR"] == scoring.GATE_FLOOR
     assert row["detected"], row["short"]
 
-    spoilt = base().scored | {"base": scoring.score_all(apart)}
-    before = replace(bare, scored=spoilt, values=bare.values | {"base": apart})
+    corrupted = base().scored | {"base": scoring.score_all(apart)}
+    before = replace(bare, scored=corrupted, values=bare.values | {"base": apart})
     (row,) = judge_outcomes([outcome("N31", 0.3, apart)], before)  # the gate failed without the control already
     assert row["short"] == {"PAR": (0.0, 30.0)}
     gone = low | {"mjx_ray_parity": values(0.0)["mjx_ray_parity"]}

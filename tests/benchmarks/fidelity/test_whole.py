@@ -42,7 +42,7 @@ def scene(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def own_scene(scene, tmp_path) -> Path:
-    """A copy to spoil, whose manifest has the hashes of its files."""
+    """A copy to corrupt, whose manifest has the hashes of its files."""
     folder = Path(shutil.copytree(scene, tmp_path / "tube"))
     manifest = json.loads((folder / "manifest.json").read_text())
     names = [f.relative_to(folder).as_posix() for f in folder.rglob("*") if f.is_file() and f.name != "manifest.json"]
@@ -201,10 +201,10 @@ def _mesh_gone_from_an_older_scene(folder: Path) -> str:
 
 
 @pytest.mark.parametrize(
-    "spoil", [_mesh_gone, _mesh_changed, _old_schema, _no_manifest, _mesh_gone_from_an_older_scene]
+    "corrupt", [_mesh_gone, _mesh_changed, _old_schema, _no_manifest, _mesh_gone_from_an_older_scene]
 )
-def test_what_is_wrong_with_a_scene_is_said_in_one_sentence(own_scene, tmp_path, monkeypatch, capsys, spoil) -> None:
-    expected = spoil(own_scene)
+def test_what_is_wrong_with_a_scene_is_said_in_one_sentence(own_scene, tmp_path, monkeypatch, capsys, corrupt) -> None:
+    expected = corrupt(own_scene)
     assert fidelity(monkeypatch, "run", "--scene", own_scene, "--out", tmp_path / "out") == 2
     said = capsys.readouterr().err.strip()
     assert said.startswith(f"error: {expected}")

@@ -134,8 +134,8 @@ def test_a_fault_leaves_the_rest_of_the_tunnel_exactly_alone(good) -> None:
     for kind, size in (("wall", 0.15), ("floor", 0.15), ("aside", 0.15), ("lift", 0.15), ("along", 0.35),
                        ("roll", 0.06), ("gauge", 0.02), ("rails", 0.06), ("track", 0.06), ("sleepers", 0.28),
                        ("missing", 1.0), ("pockets", 1.0), ("box", 1.0), ("section", 0.05)):  # fmt: skip
-        spoilt = put_in(site, Fault(kind, size, 10.0, 4.0)).candidate
-        moved = np.abs(np.asarray(spoilt.lining.vertices) - lining.vertices).max(axis=1)
+        corrupted = put_in(site, Fault(kind, size, 10.0, 4.0)).candidate
+        moved = np.abs(np.asarray(corrupted.lining.vertices) - lining.vertices).max(axis=1)
         assert moved[(station < 6.5) | (station > 17.5)].max() == 0.0, kind
 
 

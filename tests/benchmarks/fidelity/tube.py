@@ -1,4 +1,4 @@
-"""A tube whose every dimension is known, as candidate, truth and held-out recording; what is spoilt is `replace`d.
+"""A tube whose every dimension is known, as candidate, truth and held-out recording; what is corrupted is `replace`d.
 
 `case(Tube(), replace(Tube(), width=5.7))` judges a tube 10 cm too wide against the right one.
 """
@@ -147,6 +147,6 @@ def case(reference: Tube | None = None, judged: Tube | None = None, seed: int = 
     return Case(candidate(judged or reference), hold(reference, **hold_options), None, truth(reference), seed)
 
 
-def spoiled(good: Case, **changes) -> Case:
+def corrupted(good: Case, **changes) -> Case:
     """A case whose candidate differs in some fields; nothing computed of the good one is kept but the references."""
     return replace(good, candidate=replace(good.candidate, **changes), cache={})

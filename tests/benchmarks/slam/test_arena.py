@@ -260,11 +260,11 @@ def test_a_set_is_planned_from_its_seed_and_a_secret_hides_it():
 
 @pytest.mark.slow
 def test_a_set_is_resumed_and_a_program_keeps_to_furnished_walls_and_loses_smooth_ones_and_dust(tmp_path, capsys):
-    wanted = ["--courses", "walls-smooth", "walls-furnished", "dust-lock", "--distance", "12", "--jobs", "2"]
-    assert command(["arena", "--out", str(tmp_path / "set"), *wanted]) == 0
-    assert command(["arena", "--out", str(tmp_path / "set"), *wanted]) == 0
+    expected = ["--courses", "walls-smooth", "walls-furnished", "dust-lock", "--distance", "12", "--jobs", "2"]
+    assert command(["arena", "--out", str(tmp_path / "set"), *expected]) == 0
+    assert command(["arena", "--out", str(tmp_path / "set"), *expected]) == 0
     assert capsys.readouterr().err.count("there already") == 3
-    assert command(["arena", "--out", str(tmp_path / "set"), *wanted, "--seed", "1"]) == 2
+    assert command(["arena", "--out", str(tmp_path / "set"), *expected, "--seed", "1"]) == 2
     assert "was recorded with other settings" in capsys.readouterr().err
     run = ["board", "--programs", "evalio-mad", "--sets", str(tmp_path / "set"), "--out", str(tmp_path / "mad")]
     assert command(run) == 0

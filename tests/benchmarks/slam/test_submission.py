@@ -53,13 +53,13 @@ def cut(path: Path) -> None:
     path.write_text(path.read_text()[:-30] + "x")
 
 
-@pytest.mark.parametrize(("spoil", "sentence"), [
+@pytest.mark.parametrize(("corrupt", "sentence"), [
     (late, "shares 0 of its 401 times"), (few, "has 3 poses in 40 s; at least 1 a second"),
     (half, "covers 50 % of the recording; 90 % are needed"), (camera, "looks 90° away from where it drives"),
     (cut, "two.tum"), (Path.unlink, "two.tum is missing"),
 ])  # fmt: skip
-def test_each_fault_of_a_file_is_one_sentence(config, spoil, sentence):
-    spoil(config.submission / "two.tum")
+def test_each_fault_of_a_file_is_one_sentence(config, corrupt, sentence):
+    corrupt(config.submission / "two.tum")
     with pytest.raises(BenchmarkError, match=sentence) as told:
         check_submission(config)
     assert "\n" not in str(told.value)

@@ -41,7 +41,7 @@ def of(tree, k):
 
 @pytest.mark.slow
 def test_half_a_second_in_both_engines_ends_in_nearly_the_same_pose(walking, moment, in_c):
-    """From one state, told the same targets, 125 steps of physics: in C on the tunnel's own boxes, in MJX on planes."""
+    """From one state and the same targets, 125 steps of physics: in C on the tunnel's own boxes, in MJX on planes."""
     params, state, seen = moment
     robots, bodies = range(3), of(state.body, slice(3))
     shift = np.zeros((3, 3), np.float32)
@@ -50,7 +50,7 @@ def test_half_a_second_in_both_engines_ends_in_nearly_the_same_pose(walking, mom
         before = state
         _, state, _, terminated, truncated, _ = walking.step(100 + k, state, params=params)
         assert not (terminated | truncated)[:3].any()
-        # A robot that has passed on to another anchor is told from there.
+        # A robot that has passed on to another anchor is distinguished from there.
         track = params.track.position
         after = [in_c.bench.run(of(bodies, r), aims[r], origin[r], of(build, r), in_c.substeps) for r in robots]
         bodies = jax.tree.map(lambda *parts: np.stack(parts), *after)

@@ -64,11 +64,11 @@ def test_a_robot_that_is_too_slow_is_told_to_take_longer_strides():
 
 def test_servos_lead_by_what_the_load_costs_them():
     standing = follow((0.0, 0.0, 0.0), 0.5)[-1]
-    wanted = kinematics.joint_angles(foot_targets(standing, DOWN, PARAMS))
-    lead = targets(standing, DOWN, PARAMS).reshape(4, 3) - wanted
+    expected = kinematics.joint_angles(foot_targets(standing, DOWN, PARAMS))
+    lead = targets(standing, DOWN, PARAMS).reshape(4, 3) - expected
     torque = lead * kinematics.STIFFNESS
     # Carried by all four: as much as a quarter of the weight asks of the calf.
-    depth = 0.35 * np.sin(-(wanted[0, 1] + wanted[0, 2])) * np.cos(wanted[0, 0])
+    depth = 0.35 * np.sin(-(expected[0, 1] + expected[0, 2])) * np.cos(expected[0, 0])
     np.testing.assert_allclose(torque[:, 2], depth * 74.5803 * 9.81 / 4.0, rtol=1e-3)
 
 

@@ -1,4 +1,4 @@
-"""The planar robot that obeys late: its lag is what it was told to be."""
+"""The planar robot that obeys late: its lag is what it was asked to be."""
 
 import jax
 import jax.numpy as jnp

@@ -18,7 +18,7 @@ from tests.subterra_jax.tunnels import straight, tunnel_arrays
 
 
 def run(walking, seconds, params, seed=0):
-    """Zero actions for a while; last state, and what every step told."""
+    """Zero actions for a while; last state, and what every step reported."""
     _, state = walking.reset(seed, params)
     told = []
     for k in range(round(seconds / 0.02)):
@@ -117,8 +117,8 @@ def test_the_horizon_truncates_as_a_success(walking):
 def test_a_nan_in_the_action_is_read_as_nothing(walking):
     _, state = walking.reset(8)
     zero = walking.step(8, state)[0]
-    spoiled = walking.step(8, state, jnp.full((N_ROBOTS, 12), jnp.nan))[0]
-    np.testing.assert_array_equal(zero, spoiled)
+    corrupted = walking.step(8, state, jnp.full((N_ROBOTS, 12), jnp.nan))[0]
+    np.testing.assert_array_equal(zero, corrupted)
 
 
 def test_random_extreme_actions_leave_no_nan(walking):
@@ -148,7 +148,7 @@ def test_a_million_physics_steps_under_random_extreme_torques_leave_no_nan(walki
     assert fallen.sum() > 1.0
 
 
-def test_a_robot_that_leaves_the_numbers_is_a_fall_and_spoils_nobody(walking):
+def test_a_robot_that_leaves_the_numbers_is_a_fall_and_corrupts_nobody(walking):
     _, state = walking.reset(10)
     wild = dataclasses.replace(state, body=dataclasses.replace(state.body, qvel=state.body.qvel.at[0].set(1e30)))
     obs, _, reward, terminated, _, _ = walking.step(10, wild)

@@ -106,7 +106,7 @@ def assert_covariance(a, b, expected):
 
 
 def stand(id, state, steps, report=None):
-    """The robots after they were told to stand, and the info of the last step."""
+    """The robots after they were asked to stand, and the info of the last step."""
     n = len(state.station)
     action = (
         np.zeros((n, 2))

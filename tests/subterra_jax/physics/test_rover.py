@@ -1,4 +1,4 @@
-"""The rover: it drives as told where the ground lets it, and nothing lets it through."""
+"""The rover: it drives as reported where the ground lets it, and nothing lets it through."""
 
 import dataclasses
 from types import SimpleNamespace
@@ -108,7 +108,7 @@ def test_it_drives_over_sleepers_and_slips(drive):
 
 
 def test_energy_does_not_come_from_nothing(drive):
-    """Dropped by 10 cm and pushed aside at 1 m/s, told to stand: it never has more energy than at first."""
+    """Dropped by 10 cm and pushed aside at 1 m/s, asked to stand: it never has more energy than at first."""
     where, velocity = drive(0, 2.0, (0.0, 0.0), (10.0, 0.0, 0.1), velocity=(0.0, 1.0, 0.0))
     energy = 9.81 * where[:, 2] + 0.5 * np.sum(velocity**2, axis=1)  # J/kg
     assert energy.max() < 9.81 * 0.1 + 0.5 + 1e-3

@@ -13,7 +13,7 @@ from subterra_jax.b2 import constants as b2
 from subterra_jax.lidar import LidarParams
 from subterra_jax.lidar3d import Relief, beams
 from subterra_jax.lidar3d.space import Mount
-from subterra_jax.parts import Sight, make_sensor
+from subterra_jax.parts import SensingState, make_sensor
 from subterra_jax.physics.ground import read_track
 from subterra_jax.physics.riding import Physical, SwayingLidar, SwayingSpatialLidar, yaw
 from subterra_jax.state import EnvParams
@@ -30,7 +30,7 @@ def moment(params, quaternion, offset):
     body = SimpleNamespace(qpos=jnp.concatenate([offset, quaternion, jnp.zeros(12)]))
     ride, position = SimpleNamespace(body=body, anchor=jnp.int32(ANCHOR)), params.track.position[ANCHOR, :2]
     station = params.track.station[ANCHOR]
-    return Sight(params.tunnel, position + offset[:2], yaw(quaternion), station, {MOTION.name: ride})
+    return SensingState(params.tunnel, position + offset[:2], yaw(quaternion), station, {MOTION.name: ride})
 
 
 def task(params, lidar, relief=None):
@@ -104,10 +104,10 @@ def in_space(world):
 
     @jax.jit
     def ranges(quaternion, mount):
-        sight = moment(params, quaternion, jnp.array([0.0, 0.3, HEIGHT]))
+        sensing = moment(params, quaternion, jnp.array([0.0, 0.3, HEIGHT]))
         spatial = task(params, make_sensor(beams.planar(16), mount=mount), relief)
-        met, *_ = SwayingSpatialLidar(motion=MOTION).look((), sight, None, spatial)
-        return met.ranges, SwayingLidar(motion=MOTION).true_ranges((), sight, task(params, SENSOR, relief))
+        met, *_ = SwayingSpatialLidar(motion=MOTION).look((), sensing, None, spatial)
+        return met.ranges, SwayingLidar(motion=MOTION).true_ranges((), sensing, task(params, SENSOR, relief))
 
     return lambda quaternion, **mount: jax.device_get(ranges(jnp.asarray(quaternion, jnp.float32), Mount(**mount)))
 

@@ -71,8 +71,8 @@ def test_an_imu_on_a_circle_feels_the_turn_the_pull_inwards_and_gravity():
     true = measure_imu(poses, seed=0, noise=0.0)
     inner = slice(20, -20)
     np.testing.assert_allclose(true.gyro[inner], np.broadcast_to([0.0, 0.0, rate], true.gyro[inner].shape), atol=1e-6)
-    wanted = np.broadcast_to([0.0, speed * rate, GRAVITY], true.accel[inner].shape)
-    np.testing.assert_allclose(true.accel[inner], wanted, atol=2e-3)
+    expected = np.broadcast_to([0.0, speed * rate, GRAVITY], true.accel[inner].shape)
+    np.testing.assert_allclose(true.accel[inner], expected, atol=2e-3)
     noisy = measure_imu(poses, seed=0)
     assert 0.004 < np.std(noisy.gyro[:, 2] - true.gyro[:, 2]) < 0.006
     np.testing.assert_array_equal(measure_imu(poses, seed=0).accel, noisy.accel)
