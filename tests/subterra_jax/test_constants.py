@@ -20,8 +20,8 @@ from subterra_jax.rules import StartParams
 Value = float | int | list[float] | None
 
 WALKING_MISSION: dict[str, Value] = {
-    "odometry.distance_sigma": 0.01,
-    "odometry.heading_sigma": 0.001,
+    "odometry.distance_sigma": 0.0,  # its legs and its gyroscope err by themselves
+    "odometry.heading_sigma": 0.0,
     "odometry.heading_bias_sigma": 0.002,
     "odometry.distance_bias_sigma": 0.0,  # its legs measure the distance, with errors of their own
     "vehicle.speed_max": 0.8,
@@ -105,7 +105,7 @@ def halved(node: Any, path: list[str]) -> Any:
 
 
 def test_every_task_is_listed():
-    assert {*TABLE, *DIGESTS} == set(st.list_tasks())
+    assert {*TABLE, *DIGESTS} == {id for id in st.list_tasks() if id.startswith("Subterra/")}
 
 
 @pytest.mark.parametrize("id", DIGESTS)
