@@ -6,13 +6,18 @@ Example: python -m scene.limits fitting.floor judging
 """
 
 import ast
+import dataclasses
 import io
+import sys
 import tokenize
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
 import tyro
+
+from subterra_jax.host.command import parse, run_command
+from subterra_jax.host.errors import SubterraError
 
 _SIMPLE = (ast.Constant, ast.Tuple, ast.UnaryOp, ast.BinOp, ast.operator, ast.unaryop, ast.expr_context)
 
@@ -52,15 +57,38 @@ def _is_numbers(value: ast.expr) -> bool:
     return all(isinstance(node, _SIMPLE) for node in nodes) and all(isinstance(n, int | float) for n in numbers)
 
 
-def show(parts: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[PART ...]")] = (), /) -> None:
-    """Prints the thresholds of a build with their units and reasons.
+@dataclasses.dataclass(frozen=True)
+class LimitsConfig:
+    """Command line of `python -m scene.limits`.
 
-    Args:
+    Attributes:
         parts: Packages, or modules such as fitting.floor; all where none is given.
     """
+
+    parts: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[PART ...]")] = ()
+
+
+def show(parts: tuple[str, ...]) -> None:
+    """Prints the thresholds of a build with their units and reasons.
+
+    Raises:
+        SubterraError: There is no such part.
+    """
+    for part in parts:
+        if not any(list_limits(part)):
+            known = sorted({limit.part for limit in list_limits()})
+            raise SubterraError(f"no part {part!r} with thresholds; there are {', '.join(known)}")
     for limit in list_limits(*parts):
         print(f"{limit.part:20} {limit.name} = {limit.value}  # {limit.words}")
 
 
+def main(words: list[str] | None = None) -> int:
+    """Runs the command and returns its exit status."""
+    config = parse(
+        lambda given: tyro.cli(LimitsConfig, prog="python -m scene.limits", args=given, description=__doc__), words
+    )
+    return run_command(lambda: show(config.parts), mistakes=(SubterraError,))
+
+
 if __name__ == "__main__":
-    tyro.cli(show, prog="python -m scene.limits")
+    sys.exit(main())

@@ -16,6 +16,7 @@ JUNK = bytes(range(256)) * 8
 # `tunnel` is a scene folder of such bytes, /proc a folder in which nobody can write.
 MISTAKES = {
     "subterra_jax tain": "invalid choice: 'tain'",
+    "scene.limits moon": "no part 'moon' with thresholds; there are cleaning.",
     "scene.survey": "missing: --out",
     "scene.survey --out text.txt": "text.txt",
     "scene.survey --out o --truth moon": "'moon'",

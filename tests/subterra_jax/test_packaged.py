@@ -1,6 +1,7 @@
 """What is shipped: the paper's counts hold in `subterra-351`, and no file is larger than it need be."""
 
 import json
+import re
 import zlib
 from importlib import resources
 from pathlib import Path
@@ -9,7 +10,6 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from subterra_jax.host.versions import VERSION
 from subterra_jax.tunnel.shell import Shell, brick_corners
 from subterra_jax.tunnel.sources import PACKAGED
 
@@ -86,7 +86,7 @@ def test_a_packaged_tunnel_is_one_small_file_with_plane_and_heights_and_says_wha
     assert (plan.name, plan.provenance) == (facts["name"], facts["input_provenance"])
     assert plan.length == pytest.approx(facts["bore"]["length"], abs=1e-5)
     assert set(plan.shell.linings) == set(plan.linings) == {"smooth", "pockets", "furnished"}
-    assert facts["builder"] == VERSION
+    assert re.fullmatch(r"\d+\.\d+\.\d+", facts["builder"])  # an older one: no release builds them anew
     assert facts["config"]["date"] >= "2026-11-26"
     assert (DATA / f"{name}.npz").stat().st_size < 800_000
 
