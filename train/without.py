@@ -1,4 +1,4 @@
-"""Ablations: a trained policy that goes without one of the things it is reported, senses or keeps."""
+"""Ablations: a trained policy that goes without one of the things it is given, senses or keeps."""
 
 import dataclasses
 from typing import Any, Literal

@@ -51,7 +51,7 @@ class CloudSource:
     format: str  # With its version, for the manifest
     # Starts reading: x, y, z as stored, `(n, 3)` float64 each, of bounded size
     chunks: Callable[[], Iterator[Float[np.ndarray, "n 3"]]]
-    # Points from all over the file, or corners of its box, by which a unit can be reported
+    # Points from all over the file, or corners of its box, by which a unit is found
     sample: Float[np.ndarray, "k 3"]
     unit: str | None = None  # `m`, `mm` or a kind of foot, where the format or a header says so
     count: int | None = None  # Points in all, where the file knows
@@ -190,7 +190,7 @@ class Frame:
 
 
 def needs_local_points(source: CloudSource) -> bool:
-    """Return whether points that lie close together must be read before the unit of a cloud can be reported."""
+    """Return whether points that lie close together must be read before the unit of a cloud is known."""
     if source.unit not in (None, "m"):
         return False
     finite = source.sample[np.isfinite(source.sample).all(axis=1)]

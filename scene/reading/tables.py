@@ -96,7 +96,7 @@ def find_xyz(names: Sequence[str], told: dict[str, str] | None = None) -> tuple[
     return at, next(iter(units), None)
 
 
-_HEAD_BYTES = 1 << 16  # of a file by which its layout is reported
+_HEAD_BYTES = 1 << 16  # of a file by which its layout is found
 _PROBES = 16  # places of a file that are looked at
 _DECIMALS = re.compile(r"\s*(?:-?\d+,\d+\s+)+-?\d+(?:,\d+)?\s*")  # numbers apart by blanks, with commas in them
 _DELIMITERS = ((";", "semicolon"), ("\t", "tab"), (",", "comma"))

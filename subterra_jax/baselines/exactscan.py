@@ -30,7 +30,7 @@ class ExactParams:
     lateral_sigma: float = 0.01  # standard deviation of an offset that was fitted to the scan, m
     heading_sigma: float = 0.003  # standard deviation of such a heading, rad
     wall_sigma: float = 0.005  # distance of a wall from its tangent where a beam ends, m, as a standard deviation
-    # what a metre of range adds to that, 1: the tangent is reported by the curvature about the robot
+    # what a metre of range adds to that, 1: the tangent follows from the curvature about the robot
     bend_sigma: float = 0.001
     power: float = 0.5  # exponent of the likelihood: scans have errors in common
     # share of the echoes that are lost or false, where there are faults or boxes; elsewhere a tenth of it

@@ -18,7 +18,7 @@ class Panel:
         agents: The agents.
         index: Which of them acts.
         order: In which order it gets the beams.
-        goal: Goal that it is reported; NaN tells it the true one.
+        goal: Goal that it is given; NaN is it the true one.
     """
 
     agents: tuple[Any, ...]

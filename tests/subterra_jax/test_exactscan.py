@@ -82,7 +82,7 @@ def test_a_box_before_a_wall_costs_what_a_false_echo_does_in_place_of_a_true_one
     true = np.abs(beams.slant[3:5, 0]) / np.sqrt(2.0 * np.pi * beams.variance[3:5, 0])
     # One echo in fifty is false, anywhere within 30 m as likely; the root of it counts.
     assert lost == pytest.approx(0.5 * np.sum(np.log(true / (0.02 / 30.0))), abs=0.3)
-    # The other beams hold the pose: a station reported by them alone is not pulled off.
+    # The other beams hold the pose: a station found by them alone is not pulled off.
     assert gain(place, boxed, 0.3, 0.2) > gain(place, boxed, 0.3 + 5 * OFF[0], 0.2 + 5 * OFF[1]) + 2.0
 
 

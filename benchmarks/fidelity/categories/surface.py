@@ -183,7 +183,7 @@ def vox_iou_20cm(case: Case) -> Value:
 
 @metric("vox_iou_norm", "OCC", U(0.934, 0.99511), gate=True, needs="hold")
 def vox_iou_norm(case: Case) -> Value:
-    """Intersection over union of voxels taken together, over the value that two noisy draws of the candidate reach."""
+    """Intersection over union of voxels told together, over the value that two noisy draws of the candidate reach."""
     real, first, second = occupied_voxels(case).points
     return number(iou(*told_together(real, first)) / max(iou(*told_together(first, second)), 1e-12), int(real.sum()))
 

@@ -27,7 +27,7 @@ _LEAST_CELLS = 0.15  # share of a window's cells that must be known
 _LEAST_SECTOR = 6  # known cells of a window that show a sector
 _LEAST_BEAMS = 20
 _HAIR = 1e-6  # m, more than places that are one differ by rounding
-_FAINT = 0.0015  # m; where left and right of the candidate differ by less, no side can be reported
+_FAINT = 0.0015  # m; where left and right of the candidate differ by less, no side is known
 
 
 @dataclass(frozen=True)
