@@ -12,7 +12,7 @@ export XLA_PYTHON_CLIENT_PREALLOCATE ?= false
 help:            ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## */\t/' | expand -t 16
 
-demo: $(DEMO)    ## survey -> bag -> scene -> training -> out/demo/report.html; on 2 busy cores 7 minutes with set-up, 5 without
+demo: $(DEMO)    ## survey -> bag -> scene -> training -> out/demo/report.html; about 2 minutes on 2 cores after set-up
 	$(BIN)/python -m benchmarks.demo --out out/demo
 
 test: lint       ## linter, type checker, and every test that is not marked slow
