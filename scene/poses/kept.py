@@ -1,4 +1,4 @@
-"""What a build leaves beside its output while it runs: poses and cloud of a recording, so that a killed one goes on."""
+"""Poses and cloud of a recording, kept beside the output while a build runs, so that a killed one goes on."""
 
 import glob
 import hashlib

@@ -1,4 +1,4 @@
-"""How well the walls tell the station: a bound on the error along the tunnel of whoever reads one scan with a map.
+"""Bound on the error along the tunnel of whoever reads one scan with a map: what the walls give away.
 
 Channels of a beam hold independent normal noise, so that one scan knows the station to 1 / sqrt(sum of g² / (σ² + v)).
 Ranges jump at edges, where they have no slope: g is the slope of the best line through the values about a station

@@ -1,4 +1,4 @@
-"""How bright a wall is from place to place: one function for the batch, the simulated survey and pictures.
+"""Brightness of a wall from place to place: one function for the batch, the simulated survey and pictures.
 
 It is fixed to the wall, a product of what is cast, what runs down it and what was painted on it. NumPy and JAX give the
 same numbers. All sizes are ours: published ones are of single tunnels. Rock and sprayed concrete have no pattern of

@@ -1,4 +1,4 @@
-"""How bright the wall is where beams end, and how fast it comes nearer: what intensity and Doppler channels show."""
+"""Intensity and Doppler channels: brightness of the wall where beams end, and the speed at which it comes nearer."""
 
 from typing import Any
 

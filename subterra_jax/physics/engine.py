@@ -141,7 +141,7 @@ class Engine:
 
     @cached_property
     def model(self) -> mjx.Model:
-        """The same on the device."""
+        """`host` on the device."""
         with jax.ensure_compile_time_eval():
             return mjx.put_model(self.host, impl="jax")
 

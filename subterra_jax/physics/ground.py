@@ -1,4 +1,4 @@
-"""What a robot may touch: measured sleepers, rails, bed and walls, of which a window follows it.
+"""Ground and walls by physics: measured sleepers, rails, bed and lining, of which a window follows the robot.
 
 Positions are given from the nearest row of the track, the *anchor*: coordinates stay small however long the tunnel is.
 Each ball or wheel meets the tangent planes of what is nearest to it, so that the cost does not depend on the tunnel.
@@ -140,7 +140,7 @@ def _protrusion(tops: Float[np.ndarray, "k 3"], bricks: np.ndarray) -> float:
 
 @struct.dataclass
 class Window:
-    """What a robot may touch in one control period; positions from the anchor."""
+    """Ground and walls within reach in one control period; positions from the anchor."""
 
     origin: Float[Array, "3"]  # position of the anchor, tunnel frame, m
     position: Float[Array, "4 3"]  # middles of the nearest rows of the track, m

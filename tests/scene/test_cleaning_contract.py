@@ -47,7 +47,7 @@ def test_stations_of_what_was_removed_follow_the_axis():
 
 @pytest.mark.parametrize("lean", [0.0, 0.25])
 def test_a_mouth_that_the_axis_meets_aslant_ends_at_its_middle(lean: float):
-    """Where the axis leans from the bore by a quarter, floor and crown of a mouth lie 1.4 m apart along it."""
+    """Floor and crown of a mouth lie 1.4 m apart along an axis that leans from the bore by a quarter."""
     random = np.random.default_rng(3)
     angle = random.uniform(-np.pi, np.pi, 200_000)
     station = random.uniform(-2.0, 22.0, len(angle))

@@ -26,7 +26,7 @@ def built(things: list[Thing], recesses: tuple[Thing, ...] = ()) -> tuple[Bore, 
 
 
 def off_wall(surface: np.ndarray, side: int, low: float = 0.3) -> np.ndarray:
-    """How far the walls on one side lie from the true one, above a height, m."""
+    """Distances of the walls on one side from the true one, above a height, m."""
     lateral, height = surface[..., 1], surface[..., 2]
     wall = (side * lateral > 0) & (height > low) & (height < HEIGHT - 0.3)
     return lateral[wall] - side * WIDTH / 2

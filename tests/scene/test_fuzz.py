@@ -214,7 +214,7 @@ def replaced(raw: bytes, rng: random.Random) -> Iterator[bytes]:
 
 
 def refusal(read: Callable[[Path], None], path: Path) -> str | None:
-    """What is said of a file, `None` where it was read."""
+    """The sentence about a file, `None` where it was read."""
     try:
         read(path)
     except (RecordingError, FitError) as error:

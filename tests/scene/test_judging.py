@@ -118,7 +118,7 @@ def test_a_thing_is_found_where_it_is_and_named(bore, wall, name):
 
 
 def judged_without(bore: Bore, hide) -> Judgement:
-    """Of returns on the whole wall but those that `hide` takes, by station, lateral and upward offset."""
+    """Judgement of returns on the whole wall but those that `hide` takes, by station, lateral and upward offset."""
     wall = on_wall(bore)
     seen = ~hide(*wall)
     return judge_bore(bore, cloud_of(about(bore, *(v[seen] for v in wall))), JudgingConfig())

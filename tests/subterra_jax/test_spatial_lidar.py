@@ -15,6 +15,7 @@ from subterra_jax.parts import make_sensor
 from subterra_jax.parts.brightness import intensity
 from subterra_jax.parts.spatial_lidar import SENSORS, Sweeping, along_arc
 from tests.subterra_jax import tunnels
+from tests.subterra_jax.placing import observe, placed
 
 TASK, GRADE, HALF = "Subterra/TraverseShort-v1", 0.05, 2.8
 EXACT = {"sigma": 0.0, "sigma_per_metre": 0.0, "sigma_slant": 0.0, "losing": False}
@@ -35,19 +36,6 @@ def straight(grade=0.0):
 @pytest.fixture(scope="module")
 def graded():
     return straight(GRADE)
-
-
-def placed(env, params, x, y, heading):
-    _, state = env.reset(jax.random.key(0), params)
-    number = jnp.float32
-    return dataclasses.replace(
-        state, position=jnp.array([x, y], number), heading=number(heading), station=number(x), lateral=number(y)
-    )
-
-
-def observe(env, state, params, key=1):
-    flat = jax.jit(env.observe)(state, env.draw_step(jax.random.key(key), (), params), params)
-    return {name: np.asarray(flat[at]) for name, at in env.fields(params).items()}
 
 
 @pytest.mark.slow

@@ -14,6 +14,7 @@ from subterra_jax.baselines.steering import CentreLine
 from subterra_jax.host.errors import TunnelError
 from subterra_jax.host.texture import RING, brightness, texture_seed, wall_angle
 from subterra_jax.policies.locate import bends, strips
+from tests.subterra_jax.placing import observe, placed
 
 TASK, HALF = "Subterra/TraverseShort-v1", 2.8
 
@@ -51,19 +52,6 @@ def test_neighbours_are_alike_also_across_the_seam_and_joints_are_dark():
     joint = RING * np.floor(station / RING)
     assert far.mean() - np.log(brightness(np, joint, angle, 7, 1.0)).mean() > 0.3
     np.testing.assert_allclose(wall_angle(np, np.array([0.0, 2.0, -2.0]), 1.5), [0.0, np.pi / 2, -np.pi / 2])
-
-
-def placed(env, params, x, y=0.0, heading=0.0):
-    _, state = env.reset(jax.random.key(0), params)
-    number = jnp.float32
-    return dataclasses.replace(
-        state, position=jnp.array([x, y], number), heading=number(heading), station=number(x), lateral=number(y)
-    )
-
-
-def observe(env, state, params, key=1):
-    flat = jax.jit(env.observe)(state, env.draw_step(jax.random.key(key), (), params), params)
-    return {name: np.asarray(flat[at]) for name, at in env.fields(params).items()}
 
 
 def test_planar_intensities_are_those_of_the_wall_and_a_pose_moves_none_of_it():

@@ -15,7 +15,7 @@ judged = partial(against, SHORT)
 
 @cache
 def heard():
-    """The same without a truth."""
+    """A short tube without a truth."""
     return replace(tube.case(SHORT, beams=20_000), truth=None)
 
 
