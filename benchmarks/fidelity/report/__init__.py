@@ -23,7 +23,7 @@ from benchmarks.fidelity.windows.judge import dump_windows
 from benchmarks.results import commit, version
 
 
-def paper_rows(judgement: Judgement, controls: list[dict[str, Any]] | None = None) -> list[dict[str, Any]]:
+def paper_rows(judgement: Judgement) -> list[dict[str, Any]]:
     """Return a row per number of the paper: its name, the paper's figure, ours, unit, evidence class and a note."""
     scored, null = judgement.scored["base"], judgement.scored["null"].overall
 
