@@ -67,6 +67,7 @@ class TrainConfig:
     epochs: int = 4  # passes over the data of one iteration
     minibatches: int = 4  # minibatches per pass; each holds whole unrolls of `n_envs / minibatches` environments
     hidden: tuple[int, ...] = (64, 64)  # widths of the hidden layers, of policy and value alike
+    cruise: float | None = None  # largest speed of the policy, m/s; None is that of the vehicle
     standing: float = 0.5  # share of the largest speed by which the range of actions goes below 0, where a robot stands
     # standard deviation of the untrained policy before the tanh, in units of half the action range
     init_std: float = 0.5
@@ -89,6 +90,7 @@ class TrainConfig:
     # errors of the command that the localiser compares: `match` of slip, `wide` of wet rail too
     front: Literal["match", "wide"] = "match"
     map: bool = False  # the localiser learns to take a map as well
+    walls: bool = False  # show the network offset, half width and angle of the walls, as tracked, too
     drives: int = 32  # drives that the localiser learns from in one iteration
     drive_steps: int = 300  # steps of each
     drives_minibatch: int = 64  # drives in one step of the localiser's optimiser
@@ -166,6 +168,7 @@ _READ_BY: dict[str, tuple[str, ...]] = {
     "auxiliary": ("gru", "along"),
     "auxiliary_weight": ("gru",),
     "map_cell": ("map",),
+    "walls": ("along", "map"),
     **dict.fromkeys(("front", "map", "drives", "drive_steps", "drives_minibatch", "localiser_rate"), ("along",)),
 }
 
@@ -238,7 +241,7 @@ def check(config: TrainConfig) -> TrainConfig:
         raise ConfigError(f"map = True is for front = match, and front = {config.front}")
     positive(config, "map_cell", "localiser_rate", "learning_rate", "init_std", "max_grad_norm", "clip")
     not_negative(config, "standing", "entropy_weight", "value_weight", "auxiliary_weight", "stop_coverage", "target_kl")
-    positive(config, *(name for name in ("init_turn", "last_std") if getattr(config, name) is not None))
+    positive(config, *(name for name in ("init_turn", "last_std", "cruise") if getattr(config, name) is not None))
     share(config, "discount", "gae_lambda", "last_rate")
     return config
 

@@ -74,8 +74,7 @@ class LocaliserLearner:
         given = None
         if self.map is not None:
             given = draw_cases(jax.random.fold_in(key_drive, 1), drives, params)
-        left = 1.0 - iteration / config.iterations
-        rate = config.localiser_rate * (_LAST_RATE + (1.0 - _LAST_RATE) * 0.5 * (1.0 - jnp.cos(jnp.pi * left)))
+        rate = optax.cosine_decay_schedule(config.localiser_rate, config.iterations, _LAST_RATE)(iteration)
 
         def one(now: LocaliserState, index: Array) -> tuple[LocaliserState, dict[str, Array]]:
             part = jax.tree.map(lambda leaf: leaf[index], (drives, given))

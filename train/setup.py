@@ -9,7 +9,7 @@ import numpy as np
 from subterra_jax.baselines.agent import n_ranges, observed
 from subterra_jax.baselines.histogram import HistogramLocaliser
 from subterra_jax.episode import in_tunnel
-from subterra_jax.policies.inputs import WAY_AT
+from subterra_jax.policies.inputs import N_WALLS, WAY_AT
 from subterra_jax.policies.layout import Layout
 from subterra_jax.policies.locate import memory
 from subterra_jax.policies.locate.map_strip import map_strip
@@ -41,7 +41,7 @@ def make_layout(env: Any, params: Any, config: TrainConfig, given: Given | None 
     Raises:
         ConfigError: A setting does not go with the task.
     """
-    kept = Memory(config.memory, config.frames, config.map_cell)
+    kept = Memory(config.memory, config.frames, config.map_cell, config.walls)
     flat, here = jax.ShapeDtypeStruct((env.observation_size(params),), np.float32), in_tunnel(env, params, 0)
 
     def look(flat: Any) -> Any:
@@ -63,6 +63,8 @@ def make_layout(env: Any, params: Any, config: TrainConfig, given: Given | None 
         init_turn=config.init_turn,
     )
     low, high = (tuple(float(bound) for bound in side[:n_action]) for side in (bounds.low, bounds.high))
+    if config.cruise is not None:
+        high = (min(config.cruise, high[0]), *high[1:])
     return Layout(kept, shape, low, high, config.standing)
 
 
@@ -147,16 +149,16 @@ def _fitting(driver: Driver, given: Policy, config: TrainConfig) -> Policy:
 def _widened(tensor: np.ndarray, shape: tuple[int, ...], frames: int) -> np.ndarray | None:
     """Returns weights for more inputs, 0 for those that are new; None where they do not fit.
 
-    One number more in each observation, the localiser's doubt, is what `along` adds to a policy that has none; earlier
-    observations come before the newest.
+    The localiser's doubt is what `along` adds to each observation of a policy that has none, and the walls beside the
+    robot, where they are shown; earlier observations come before the newest.
     """
     if tensor.shape == shape:
         return tensor
     if tensor.shape[1:] != shape[1:]:
         return None
     for known in (frames, 1):
-        doubt = shape[0] // frames - tensor.shape[0] // known
-        if tensor.shape[0] % known == 0 and doubt in (0, 1):
+        more = shape[0] // frames - tensor.shape[0] // known
+        if tensor.shape[0] % known == 0 and more in (0, 1, N_WALLS, 1 + N_WALLS):
             rows = tensor.reshape(known, -1, *tensor.shape[1:])
-            return np.pad(rows, [(frames - known, 0), (0, doubt), *[(0, 0)] * (tensor.ndim - 1)]).reshape(shape)
+            return np.pad(rows, [(frames - known, 0), (0, more), *[(0, 0)] * (tensor.ndim - 1)]).reshape(shape)
     return None

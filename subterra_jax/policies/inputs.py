@@ -12,12 +12,14 @@ from jaxtyping import Array, Bool, Float
 
 from subterra_jax.baselines.agent import LIDAR_ENTRIES, Observed
 from subterra_jax.baselines.stations import told_start
+from subterra_jax.baselines.steering import Corridor
 from subterra_jax.parts.unicycle import wrap
 from subterra_jax.state import EnvParams
 
 _NEAR = 3.0  # m; ranges below this are resolved finely
 _SCALES = (1.0, 4.0, 20.0)  # m; scales of the way to go
 FAR = 100.0  # m; the largest scale
+_TURN = 3.0  # 1/rad; unit of an angle to the walls
 _AROUND = 2.2  # rad; who has turned so far since the flag drives back
 _KNOWN = LIDAR_ENTRIES | {"odometry", "goal", "ring_pitch", "start", "flag"}
 
@@ -103,11 +105,17 @@ def look(
     return jnp.concatenate([*parts, *(jnp.arcsinh(value.astype(jnp.float32)) for value in further)])
 
 
+def beside(walls: Corridor) -> Float[Array, "3"]:
+    """Returns offset from the middle, half width and angle of walls that were tracked through lost beams and dust."""
+    return jnp.stack([walls.offset, (walls.left + walls.right) / (2.0 * _NEAR), _TURN * walls.angle])
+
+
 def scaled_way(way: Float[Array, "*batch"]) -> Float[Array, "*batch 4"]:
     """Returns a distance at several scales, from decimetres on."""
     return jnp.stack([*(jnp.tanh(way / scale) for scale in _SCALES), way / FAR], axis=-1)
 
 
+N_WALLS = 3  # numbers of `beside`
 WAY_AT = len(_SCALES)  # place of the way to go over `FAR` among the inputs of one observation
 
 

@@ -54,6 +54,7 @@ class Memory:
     kind: str = "none"  # one of `MEMORIES`
     frames: int = 1  # observations in the stack, the newest included; 1 but with `stack`, `along`
     cell: float = 0.1  # length of a cell of the belief, m; for `map`
+    walls: bool = False  # show the walls as they are tracked from scan to scan too; where a localiser does so
 
     @property
     def locates(self) -> bool:
@@ -92,9 +93,10 @@ class Memory:
         """Returns the inputs of the network, the oldest observation first."""
         return jnp.concatenate([kept.stack.reshape(-1), kept.seen])
 
-    def far_from_goal(self, reckoned: Reckoned, obs: Observed, params: EnvParams) -> Float[Array, "n"]:
+    def far_from_goal(self, reckoned: Reckoned, walls: Corridor, obs: Observed, params: EnvParams) -> Float[Array, "n"]:
         """Returns the inputs of a robot whose goal is far away, for `along`."""
-        return jnp.append(inputs.look(reckoned, obs, jnp.float32(inputs.FAR), params, self.relief), 0.0)
+        seen = inputs.look(reckoned, obs, jnp.float32(inputs.FAR), params, self.relief)
+        return self._with_place(seen, jnp.zeros(()), walls)
 
     def report(
         self, kept: Kept, command: Float[Array, "2"], obs: Observed | None, params: EnvParams
@@ -136,7 +138,12 @@ class Memory:
             if params.goal_kind == "return":
                 way = jnp.where(reckoned.flag > 0.5, station - told_start(obs, params), way)
         seen = inputs.look(reckoned, obs, way, params, self.relief)
-        return jnp.append(seen, log_sigma) if self.locates else seen
+        return seen if located is None else self._with_place(seen, log_sigma, located.walls)
+
+    def _with_place(self, seen: Array, log_sigma: Array, walls: Corridor) -> Array:
+        """Returns inputs with what the localiser adds to them."""
+        further = inputs.beside(walls) if self.walls else jnp.zeros(0)
+        return jnp.concatenate([seen, log_sigma[None], further])
 
     def _locate(
         self,

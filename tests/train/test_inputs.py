@@ -173,9 +173,13 @@ def test_a_filter_on_the_map_reports_what_it_believes_in_training_as_in_driving(
 def test_a_localiser_drives_in_training_as_in_an_agent(plan):
     localiser = begin_with("locate-transformer").localiser
     driver, policy, agent, seen, read = train_and_drive(
-        plan, "StopAtShort-v1", TrainConfig(hidden=(8,), memory="along"), localiser
+        plan, "StopAtShort-v1", TrainConfig(hidden=(8,), memory="along", walls=True, cruise=1.2), localiser
     )
     assert seen.shape[-1] == driver.layout.shape.n_inputs
     assert agent.given.weights["match"]["taps"].shape == policy.localiser["match"]["taps"].shape
     np.testing.assert_allclose(read[:, :4], seen[:, :4], atol=1e-4)
-    np.testing.assert_allclose(read[:, -1], seen[:, -1], atol=1e-4)
+    np.testing.assert_allclose(read[:, -4], seen[:, -4], atol=1e-4)
+    np.testing.assert_allclose(read[:, -3:], seen[:, -3:], atol=0.2)  # the scan's noise of a step is drawn anew
+    assert np.all(np.std(seen[:, -3:], axis=0) > 0.0)
+    assert float(driver.action(jnp.array([9.0, 0.0]))[0]) == pytest.approx(1.2)
+    assert float(agent.high[0]) == pytest.approx(1.2)

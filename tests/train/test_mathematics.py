@@ -1,11 +1,15 @@
 """Advantages, running statistics and discounted returns against slow definitions."""
 
+import dataclasses
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from train import devices, learning
+from train import devices, learning, localiser
+from train.config import TrainConfig
 
 
 def slow_advantages(reward, value, last_value, final_value, terminated, truncated, discount, gae_lambda):
@@ -96,3 +100,17 @@ def test_discounted_returns_begin_anew_with_every_episode_and_go_on_between_unro
     np.testing.assert_allclose(after, [1.5])
     after, _ = learning.discounted_returns(after, reward[:1], jnp.array([[True]]), 0.5)
     np.testing.assert_allclose(after, [0.0])
+
+
+def test_the_localiser_learns_ever_more_slowly_down_to_a_fiftieth(monkeypatch):
+    config = TrainConfig(memory="along", auxiliary=True, drives=2, steps=10 * 128 * 64)
+    params = SimpleNamespace(vehicle=SimpleNamespace(period=0.1, speed_max=2.0))
+    learner = localiser.LocaliserLearner(None, params, config)
+    up = lambda weights, part: ((jnp.zeros(()), {}), jax.tree.map(jnp.ones_like, weights))  # noqa: E731
+    monkeypatch.setattr(learner, "_gradients", up)
+    monkeypatch.setattr(localiser, "record_drives", lambda *_: jnp.zeros(2))
+    before = dataclasses.replace(learner.init(jax.random.PRNGKey(0)), steps=jnp.int32(1000))
+    bias = lambda state: float(state.weights["out"]["bias"][0])  # noqa: E731
+    learn = jax.jit(lambda iteration: learner.learn(before, None, params, jax.random.PRNGKey(1), iteration)[0])
+    moved = [bias(before) - bias(learn(iteration)) for iteration in (0, 5, 10)]
+    np.testing.assert_allclose(moved, config.localiser_rate * np.array([1.0, 0.51, 0.02]), rtol=1e-2)

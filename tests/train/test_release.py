@@ -114,17 +114,17 @@ def test_what_is_released_is_scored_like_the_run_it_comes_from(trained, tunnel, 
     assert "must end in .safetensors" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("frames", [1, 2])
-def test_a_localiser_begins_from_a_policy_that_has_none_and_drives_as_it_does(tmp_path, frames):
+@pytest.mark.parametrize(("frames", "walls"), [(1, False), (2, False), (2, True)])
+def test_a_localiser_begins_from_a_policy_that_has_none_and_drives_as_it_does(tmp_path, frames, walls):
     world = open_world("StopAtShort-v1", "open:cast:train:0")
     kept = TrainConfig(memory="stack", frames=frames, hidden=(8,))
     driver, file = make_learner(world, kept).driver, tmp_path / "stack.safetensors"
     weights = driver.init(jax.random.PRNGKey(0))
     write_tensors(file, driver.kind, driver.layout, driver.tensors(Policy(weights)), {"task": GOAL_TASK, "world": {}})
-    own = dataclasses.replace(kept, memory="along", begin_from=f"{file},locate-transformer")
+    own = dataclasses.replace(kept, memory="along", walls=walls, begin_from=f"{file},locate-transformer")
     learner = make_learner(world, own)
     rows = jax.random.normal(jax.random.PRNGKey(1), (frames, driver.layout.shape.n_inputs // frames))
-    doubts = np.concatenate([rows, np.full((frames, 1), 7.0)], axis=1)  # which nothing is made of yet
+    doubts = np.concatenate([rows, np.full((frames, 4 if walls else 1), 7.0)], axis=1)  # nothing is made of them yet
     before, _ = driver.answer(Policy(weights), rows.reshape(-1), driver.start_memory(()))
     after, _ = learner.driver.answer(learner.given, doubts.reshape(-1), driver.start_memory(()))
     np.testing.assert_allclose(after.mean, before.mean, atol=1e-5)
