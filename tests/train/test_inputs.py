@@ -182,4 +182,7 @@ def test_a_localiser_drives_in_training_as_in_an_agent(plan):
     np.testing.assert_allclose(read[:, -3:], seen[:, -3:], atol=0.2)  # the scan's noise of a step is drawn anew
     assert np.all(np.std(seen[:, -3:], axis=0) > 0.0)
     assert float(driver.action(jnp.array([9.0, 0.0]))[0]) == pytest.approx(1.2)
-    assert float(agent.high[0]) == pytest.approx(1.2)
+    env, params = st.make("Subterra/StopAtShort-v1", tunnel=plan)
+    policies.check_task(agent, env, params, "mine")
+    with pytest.raises(policies.PolicyError, match=r"made for actions up to \[2.5, 1.5\]"):
+        policies.check_task(dataclasses.replace(agent, high=agent.high.at[0].set(2.5)), env, params, "mine")
