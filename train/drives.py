@@ -60,7 +60,7 @@ def record_drives(driver: Driver, policy: Policy, params: Any, key: PRNGKeyArray
         return reckoned, walls_of.look(walls, obs, command, params)
 
     def read(kept: Any, obs: Any) -> Array:
-        return driver.layout.memory.far_from_goal(*kept, obs, params)
+        return driver.layout.memory.far_from_goal(kept[0], kept[1], obs, params)
 
     seen = jax.vmap(see)(state, env.draw_step(keys[3], (n_envs,), params))
     zero = jnp.zeros(n_envs)

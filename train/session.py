@@ -19,13 +19,7 @@ from train.config import ConfigError
 from train.curve import GOAL, write_curve
 from train.evaluate import evaluate
 from train.folder import RunFolder
-from train.log import (
-    Bar,
-    RunLog,
-    deferred_interrupt,
-    print_table,
-    read_log,
-)
+from train.log import Bar, RunLog, deferred_interrupt, print_table, read_log
 from train.policies import make_agent
 from train.ppo import train_seeds
 from train.sinks import NO_LOGS, Logs, Sink

@@ -39,7 +39,7 @@ class Logs:
             UserCodeError: `log` cannot be loaded.
         """
         if self.tensorboard:
-            check_tensorboard()
+            tensorboard_writer()
         if self.log is not None:
             load_log(self.log)
         if self.wandb is not None:
@@ -146,11 +146,6 @@ def _wandb() -> Any:
     return wandb
 
 
-def check_tensorboard() -> None:
-    """Raises `ConfigError` where the library that writes such logs is not installed."""
-    _writer()
-
-
 class Board:
     """Scalars of every iteration in `tensorboard/`, against environment steps.
 
@@ -164,7 +159,7 @@ class Board:
 
     def __init__(self, run: Path, step: int = 0) -> None:
         # Iterations after the last checkpoint come again: TensorBoard then drops what it has from there on.
-        self._writer = _writer()(str(run / TENSORBOARD), purge_step=step + 1 if step else None)
+        self._writer = tensorboard_writer()(str(run / TENSORBOARD), purge_step=step + 1 if step else None)
 
     def write(self, record: dict[str, Any]) -> None:
         """Adds one iteration; scalars that are not known yet are left out."""
@@ -187,7 +182,8 @@ def _tag(name: str) -> str:
     return f"{'episodes' if name.endswith('_100') or name.startswith(('finished', 'episodes')) else 'learning'}/{name}"
 
 
-def _writer() -> Any:
+def tensorboard_writer() -> Any:
+    """Returns the class that writes such logs; raises `ConfigError` where its library is not installed."""
     try:
         from tensorboardX import SummaryWriter
     except ImportError as missing:

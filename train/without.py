@@ -23,8 +23,9 @@ class Forgetful(Memory):
     """As `along`, but the way to go is dead-reckoned."""
 
     def _look(self, reckoned: Reckoned, located: Located | None, obs: Observed, params: EnvParams) -> Array:
-        way = inputs.way_to_go(reckoned, obs, params)
-        return jnp.append(inputs.look(reckoned, obs, way, params, self.relief), 0.0)
+        assert located is not None
+        seen = inputs.look(reckoned, obs, inputs.way_to_go(reckoned, obs, params), params, self.relief)
+        return self._with_place(seen, jnp.zeros(()), located.walls)
 
 
 @struct.dataclass

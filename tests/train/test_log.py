@@ -77,7 +77,7 @@ def events(content, event_type):
 def test_tensorboard_without_its_library_is_a_clear_error(monkeypatch):
     monkeypatch.setitem(sys.modules, "tensorboardX", None)
     with pytest.raises(ConfigError, match=r"needs tensorboardX: pip install 'subterra-jax\[logs\]'"):
-        sinks.check_tensorboard()
+        sinks.tensorboard_writer()
 
 
 def runs(folder, coverages, task="Subterra/Traverse-v1"):
