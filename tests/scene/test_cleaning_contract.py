@@ -36,15 +36,6 @@ def test_what_was_removed_is_listed_by_stretch_with_its_place_in_the_frame_of_th
     np.testing.assert_allclose(removed[-1].place, there, atol=1e-3)
 
 
-def test_stations_of_what_was_removed_follow_the_axis():
-    cloud = thin(curved_d_bore(length=20).points)
-    cause = np.zeros(len(cloud.points), np.int8)
-    cause[:10] = Cause.INSIDE
-    (part,) = list_removed(cloud, cause, np.full(len(cause), 4.0), gap=1.0)
-    assert (part.shifted(-1.5).start, part.shifted(-1.5).end) == (2.5, 2.5)
-    assert (part.reversed(20.0).start, part.reversed(20.0).end) == (16.0, 16.0)
-
-
 @pytest.mark.parametrize("lean", [0.0, 0.25])
 def test_a_mouth_that_the_axis_meets_aslant_ends_at_its_middle(lean: float):
     """Floor and crown of a mouth lie 1.4 m apart along an axis that leans from the bore by a quarter."""

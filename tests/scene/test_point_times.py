@@ -7,7 +7,6 @@ from rosbags.rosbag2 import StoragePlugin
 from scene.errors import RecordingError
 from scene.reading.recording import Recording
 from tests.scene.messages import (
-    HESAI,
     LIVOX2,
     OUSTER,
     PLAIN,
@@ -33,30 +32,6 @@ def read(path, **options):
         return list(recording.scans()), recording.facts
 
 
-CONVENTIONS = {
-    "velodyne, stamp at the end": (VELODYNE, 24, {"time": SWEEP - 0.0975}, 99.9025, "`time`, s before the stamp"),
-    "velodyne, stamp at the start": (VELODYNE, 22, {"time": SWEEP}, 100.0, "`time`, s after the stamp"),
-    "ouster": (OUSTER, 48, {"t": (SWEEP * 1e9).astype("u4")}, 100.0, "`t`, ns after the stamp"),
-    "hesai": (HESAI, 26, {"timestamp": 1.7e9 + SWEEP}, 1.7e9, "`timestamp`, absolute, s"),
-    "livox driver 2": (HESAI, 26, {"timestamp": 1.7e18 + SWEEP * 1e9}, 1.7e9, "`timestamp`, absolute, ns"),
-    "another clock": (HESAI, 26, {"timestamp": 1.6e9 + SWEEP}, 1.7e9, "absolute by another clock, s"),
-    "milliseconds": (VELODYNE, 24, {"time": SWEEP * 1e3}, 100.0, "`time`, ms after the stamp"),
-}
-
-
-@pytest.mark.parametrize("name", CONVENTIONS)
-@pytest.mark.parametrize("big", [False, True])
-def test_every_driver_s_point_times_become_seconds_after_the_start_of_the_sweep(tmp_path, name, big):
-    fields, step, times, start, said = CONVENTIONS[name]
-    stamp = 1.7e9 if start > 1e9 else 100.0
-    raw = pointcloud2(stamp, fields, step, columns(**times), big=big)
-    (scan,), facts = read(write_bag1(tmp_path / "a.bag", {"/points": [(stamp, raw)]}))
-    assert said in facts["point_times"]
-    assert scan.stamp == pytest.approx(start, abs=1e-6)
-    np.testing.assert_allclose(scan.times, SWEEP, atol=1e-6)
-    np.testing.assert_array_equal(scan.points, XYZ)
-
-
 @pytest.mark.parametrize("extra", [{}, {"time": np.zeros(40)}])
 def test_a_cloud_without_point_times_is_a_static_sweep_and_says_so(tmp_path, extra):
     fields, step = (VELODYNE, 22) if extra else (PLAIN, 12)
@@ -72,14 +47,6 @@ def test_returns_come_in_the_order_of_time_whatever_the_order_of_rings(tmp_path)
     raw = pointcloud2(5.0, OUSTER, 32, columns(XYZ[order], t=(SWEEP[order] * 1e9).astype("u4")), height=4)
     (scan,), _ = read(write_bag1(tmp_path / "a.bag", {"/ouster/points": [(5.0, raw)]}))
     np.testing.assert_array_equal(scan.points, XYZ)
-
-
-def test_padding_behind_rows_and_zero_and_nan_returns_are_dropped(tmp_path):
-    points = XYZ.copy()
-    points[3], points[7, 1], points[9] = 0, np.nan, np.inf
-    raw = pointcloud2(5.0, OUSTER, 32, columns(points, t=(SWEEP * 1e9).astype("u4")), height=4, row_padding=13)
-    (scan,), _ = read(write_bag1(tmp_path / "a.bag", {"/ouster/points": [(5.0, raw)]}))
-    np.testing.assert_array_equal(scan.points, np.delete(XYZ, [3, 7, 9], axis=0))
 
 
 def test_the_sensor_s_topic_is_preferred_and_the_others_are_named(tmp_path):

@@ -9,7 +9,6 @@ from scene.bore import Bore, load_bore
 from scene.cloud import Cloud
 from scene.errors import FitError
 from scene.fitting.section import fit_sections
-from scene.fitting.unroll import median_smooth
 from tests.scene.clouds import KnownBore, curved_d_bore
 from tests.scene.fits import axis_of, rebuilt, thin
 from tests.scene.shapes import PLACE, midline, outline, swept
@@ -36,34 +35,9 @@ def test_a_curved_d_bore_is_measured_in_any_orientation(yaw):
     assert not bore.filled.any()
 
 
-def test_frames_are_orthonormal_and_lateral_points_left():
-    bore, _ = rebuilt(curved_d_bore(length=20, per_metre=1500).points)
-    np.testing.assert_allclose(np.cross(bore.up, bore.tangent), bore.lateral, atol=1e-12)
-    np.testing.assert_allclose(bore.lateral[:, 2], 0, atol=1e-12)
-    steps = np.diff(bore.position, axis=0)
-    np.testing.assert_allclose(np.linalg.norm(steps, axis=1), np.diff(bore.station), rtol=1e-3)
-
-
 def test_an_axis_knows_its_bend_to_the_left_and_its_grade(bore):
     np.testing.assert_allclose(bore.axis.curvature[30:-30], 1 / 60, rtol=0.02)
     np.testing.assert_allclose(bore.axis.grade[30:-30], 0.01, rtol=0.02)
-
-
-def test_rails_and_people_do_not_move_floor_or_walls():
-    known = curved_d_bore(length=30, radius=1e6, grade=0.0, yaw=0.0, offset=(0, 0, 0))
-    rng = np.random.default_rng(1)
-    rails = np.stack(
-        [
-            rng.uniform(0, 30, 8000),
-            rng.choice([-0.75, 0.75], 8000) + rng.normal(0, 0.03, 8000),
-            rng.uniform(-3.0, -2.9, 8000),
-        ],
-        axis=1,
-    )
-    person = np.array([15.0, 1.6, -2.3]) + rng.normal(0, [0.15, 0.15, 0.4], (4000, 3))
-    bore, _ = rebuilt(np.concatenate([known.points, rails, person]), STRAIGHT)
-    assert np.abs(bore.width - known.width).max() < 0.05
-    assert np.abs(bore.height - known.height).max() < 0.05
 
 
 def test_a_hole_in_the_survey_is_filled_and_marked():
@@ -125,8 +99,3 @@ def test_the_corner_of_wall_and_floor_is_not_cut_off(kind):
     corner = section[np.argmax(np.hypot(section[:, 0], section[:, 1] - 0.5) * (section[:, 1] < 0))]
     gap = np.hypot(*(wall - corner).T).min(initial=np.inf)
     assert gap < 0.06
-
-
-def test_a_window_of_one_column_smooths_along_alone():
-    field = np.tile([[1.0], [1.0], [9.0], [1.0], [1.0]], (1, 4)) + np.arange(4)
-    np.testing.assert_array_equal(median_smooth(field, (3, 1)), np.ones((5, 4)) + np.arange(4))

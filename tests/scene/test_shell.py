@@ -8,7 +8,7 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from scene.bore import NAIL, load_bore
+from scene.bore import NAIL
 from scene.writing.folder import write_geometry
 from scene.writing.mesh import build_solid
 from scene.writing.mjcf import SceneConfig
@@ -16,7 +16,6 @@ from scene.writing.planar import cut_walls, half_widths, ring_pitch, save_tunnel
 from scene.writing.track import TrackConfig, lay_track
 from subterra_jax.host.errors import TunnelError
 from subterra_jax.lidar3d import rolled, surface
-from subterra_jax.tunnel.shell import brick_corners, make_bricks
 from subterra_jax.tunnel.sources import load_tunnel, read_tunnel
 
 
@@ -35,12 +34,6 @@ def test_smooth_walls_run_at_half_the_width_over_the_whole_length(bore, walls):
         assert station[0] == pytest.approx(0, abs=0.05)
         assert station[-1] == pytest.approx(bore.length, abs=0.05)
         assert (np.diff(station) >= 0).all()
-
-
-def test_left_is_left_of_the_centreline(bore, walls):
-    plan = bore.axis.in_plan()
-    for wall, side in ((walls["smooth"].left, 1), (walls["smooth"].right, -1)):
-        assert (side * plan.local(np.column_stack([wall, np.zeros(len(wall))]))[1] > 2.7).all()
 
 
 def test_pockets_are_recesses_of_13_cm_with_upright_sides(bore, walls):
@@ -138,20 +131,6 @@ def test_every_corner_of_the_shell_is_one_of_the_scene_and_the_other_way_round(b
             assert gap.max() < most
 
 
-def test_the_axis_is_that_of_the_bore(built):
-    folder, plan = built
-    axis, _ = rolled.raise_shell(plan.shell, "pockets")
-    expected = load_bore(folder / "bore.npz")
-    np.testing.assert_allclose(axis.position, expected.position, atol=2e-5)
-    np.testing.assert_allclose(axis.tangent, expected.tangent, atol=2e-5)
-
-
-def test_the_radius_is_kept_to_a_tenth_of_a_millimetre(built, bore):
-    _, plan = built
-    assert np.abs(plan.shell.radius - bore.radius).max() <= 0.51e-4
-    np.testing.assert_allclose(plan.shell.section, bore.radius.mean(axis=0), atol=1e-5)
-
-
 def test_recesses_that_touch_are_joined_as_in_the_scene(bore, tmp_path):
     rows = bore.pocket.copy()
     rows["station"][4:8] = rows["station"][4:8].mean() + np.array([0.0, 0.0, 0.13, 0.13])
@@ -211,10 +190,3 @@ def test_a_corrupted_field_is_named(built, tmp_path, changed, says):
 def test_an_unknown_lining_is_named(built):
     with pytest.raises(TunnelError, match="the shell has no lining 'rough'; it has smooth, pockets, furnished"):
         rolled.raise_shell(built[1].shell, "rough")
-
-
-def test_a_brick_has_its_corners_where_they_are_asked_for():
-    brick = make_bricks(np.array([[1.0, 2.0, 3.0]]), np.array([np.pi / 2]), np.array([[0.5, 0.2, 0.1]]), 0.2)
-    corner = brick_corners(brick)[0]
-    np.testing.assert_allclose(corner[0b111], [0.8, 2.4, 3.1], atol=1e-12)
-    np.testing.assert_allclose(corner[0b000], [1.2, 1.4, 2.9], atol=1e-12)

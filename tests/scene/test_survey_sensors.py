@@ -156,36 +156,6 @@ def test_a_calibration_places_the_prism_where_the_total_station_saw_it(
             np.testing.assert_allclose(read.imu[topic].shift, mount.shift, atol=1e-8)
 
 
-def printed(shift: list[float], wxyz: list[float]) -> np.ndarray:
-    transform = np.eye(4)
-    transform[:3, :3], transform[:3, 3] = Rotation.from_quat([*wxyz[1:], wxyz[0]]).as_matrix(), shift
-    return transform
-
-
-# As GEODE's scripts print them: LiDAR to target, t and q as w x y z.
-TARGETS = {
-    "_os1": (
-        printed([-0.0108864, 0.293397, -0.452674], [0.999991, 0.000903519, 0.0035434, -0.00220342]),
-        printed([0.00947221, -0.308202, -0.365733], [0.999901, -0.00492765, 0.00575961, 0.0117651]),
-    ),
-    "_vlp16": (
-        printed([0.0090, -0.2925, 0.4533], [0.9999909, -0.0009, -0.00355, 0.0022]),
-        printed([0.0305, -0.5959, 0.0902], [0.9998828, -0.0057758, 0.0022253, 0.0140019]),
-    ),
-}
-
-
-@pytest.mark.parametrize("suffix", TARGETS)
-def test_the_rack_is_rigid_and_geodes_own(folder: Path, suffix: str) -> None:
-    first, other = load_trajectory(folder / "groundtruth.tum"), load_trajectory(folder / f"groundtruth{suffix}.tum")
-    own, avia = TARGETS[suffix]
-    mount = np.linalg.inv(avia) @ own  # the LiDAR's pose in the Avia's frame
-    lever = first.attitude.inv().apply(other.position - first.position)
-    np.testing.assert_allclose(lever, np.broadcast_to(mount[:3, 3], lever.shape), atol=3e-6)
-    turn = first.attitude.inv() * other.attitude
-    assert (Rotation.from_matrix(mount[:3, :3]).inv() * turn).magnitude().max() < 1e-6
-
-
 def test_a_sensor_records_the_same_whatever_else_is_on_the_rack(folder: Path, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(simulate, "_WORTH_A_PROCESS", 0.0)  # and in a process of its own
     fewer = make(tmp_path / "fewer", "--sensors", "os1", "vlp16")

@@ -7,14 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.spatial import KDTree
 
 import subterra_jax as st
 from benchmarks import reference
 from subterra_jax import lidar
 from subterra_jax.parts.unicycle import VehicleParams
 from subterra_jax.tunnel.arrays import ROBOT_RADIUS
-from subterra_jax.tunnel.distances import gaps_near
 from tests.subterra_jax.tunnels import straight, tunnel_arrays
 
 LINE = np.column_stack([np.linspace(0.0, 120.0, 121), np.zeros(121)])
@@ -158,19 +156,6 @@ def test_a_mistake_is_refused_in_one_sentence(make, message):
     with pytest.raises(st.TunnelError, match=message) as caught:
         make()
     assert "\n" not in str(caught.value)
-
-
-def test_the_gaps_to_walls_are_those_of_brute_force():
-    rng = np.random.default_rng(0)
-    nodes = rng.uniform(0.0, 60.0, (300, 2))
-    start = rng.uniform(0.0, 60.0, (40, 2))
-    segments = np.hstack([start, start + rng.normal(0.0, 1.0, (40, 2)) * rng.uniform(0.01, 30.0, (40, 1))])
-    gap = gaps_near(KDTree(nodes), segments, 1.4)
-    exact = reference.clearance(segments, nodes)
-    near = exact <= 1.4
-    assert 20 < near.sum() < 280
-    np.testing.assert_allclose(gap[near], exact[near], atol=1e-9)
-    assert (gap[~near] > 1.4).all()
 
 
 def test_a_tunnel_of_20_km_is_checked_in_a_moment():

@@ -1,14 +1,9 @@
 """Boxes around pieces of wall: known rectangles, lids over pockets, and windows found by brute force."""
 
-import functools
-
 import numpy as np
 import pytest
 
-import subterra_jax as st
-from benchmarks import reference
-from subterra_jax.procedural import open_world
-from subterra_jax.tunnel import Tunnel, blocks, from_centreline
+from subterra_jax.tunnel import blocks, from_centreline
 from subterra_jax.tunnel.order import order, windows
 
 
@@ -20,25 +15,6 @@ def test_a_pocket_gets_a_lid_and_a_deep_wide_niche_does_not():
     hull, size = blocks.add_lids(pieces, np.full(3, 6), np.array([-1.0, -1.0, 0.0]))
     assert size.tolist() == [2, 6, 6]
     np.testing.assert_array_equal(hull[0, :2], [[0.0, 0.0], [2.0, 0.0]])
-
-
-def test_windows_hold_every_block_within_reach_found_one_by_one():
-    plan = st.load_tunnel("open:straight:val:3").slice(40.0, 90.0)
-    cut = blocks.build_blocks(plan, plan.lining("built"), 2.0, 16)
-    first, count = windows(plan, cut, 12.0)
-    vertex = cut.offset + cut.centre[:, None]
-    segments = [np.hstack([v[:-1], v[1:]]) for v in vertex]
-    for node in range(0, len(plan.station), 15):
-        near = [i for i, s in enumerate(segments) if reference.clearance(s, plan.centre[node : node + 1])[0] < 12.0]
-        assert first[node] <= min(near)
-        assert max(near) < first[node] + count[node]
-
-
-def test_a_tunnel_ten_times_as_long_has_no_larger_windows():
-    make = functools.partial(open_world.plan, "open:straight:val:3", variants=("built",), solid=False)
-    short, long = (Tunnel.from_plan(make(length=length)) for length in (351.0, 3510.0))
-    assert float(long.length) == pytest.approx(3510.0)
-    assert long.n_scan <= short.n_scan + 4
 
 
 def test_a_beam_visits_few_blocks_of_a_straight_tunnel():

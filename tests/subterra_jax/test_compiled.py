@@ -146,13 +146,6 @@ def test_replacing_a_count_by_a_fraction_is_refused(horizon):
     assert int(params.replace(horizon=50.0).horizon) == 50
 
 
-def test_replacing_leaves_a_tree_of_axes_as_it_is():
-    _, params = st.make("Subterra/StopAtShort-v1")
-    axes = jax.tree.map(lambda _: None, params).replace(horizon=0)
-    assert axes.horizon == 0
-    assert isinstance(axes.horizon, int)
-
-
 def count(event: str, function: Any) -> int:
     """Return the number of times that JAX reports an event while a function runs."""
     counts = []
@@ -192,18 +185,6 @@ def test_a_rollout_compiles_once_for_a_policy_and_reads_its_weights_each_time(sh
         for own in (inner, jax.jit(lambda obs: jnp.zeros((3, 1)) + jnp.float32(1.25)))
     )
     assert [float(roll(first)), float(roll(second))] == [0.75, 1.25]
-
-
-def test_a_second_env_compiles_nothing(short):
-    env, params, state = short
-    again, others = st.make("Subterra/StopAtShort-v1")
-    env.step(jax.random.key(1), state, jnp.ones(2), params)
-
-    def use():
-        _, state = again.reset(jax.random.key(0), others)
-        again.step(jax.random.key(1), state, jnp.ones(2), others)
-
-    assert count(COMPILES, use) == 0
 
 
 def test_a_rule_that_cannot_be_hashed_runs_all_the_same(short):

@@ -142,17 +142,6 @@ def test_params_may_be_batched(leaves):
         leaves_equal(one, jax.tree.map(lambda x, i=i: x[i], batched), atol=2e-4)
 
 
-def test_an_episode_is_truncated_at_the_horizon_and_that_is_not_termination():
-    env, params = st.make("Subterra/TraverseShort-v1", horizon=5)
-    _, state = jax.jit(env.reset)(jax.random.key(0), params)
-    step = jax.jit(env.step)
-    for k in range(5):
-        _, state, _, terminated, truncated, info = step(jax.random.key(k), state, jnp.array([0.5, 0.0]), params)
-        assert not terminated
-        assert bool(truncated) == (k == 4)
-    assert not info["success"]
-
-
 def test_ninety_percent_coverage_is_success_and_ends_the_episode_once():
     env, params = st.make("Subterra/TraverseShort-v1", start=StartParams(station=53.0, lateral=0.0, heading=0.0))
     _, state = jax.jit(env.reset)(jax.random.key(0), params)

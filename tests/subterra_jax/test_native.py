@@ -53,15 +53,6 @@ def test_scans_are_those_of_xla(plan, lining):
     check_same(plan, lining)
 
 
-def test_scans_near_the_mouths_are_those_of_xla(plan):
-    check_same(plan, "pockets", near_mouths=True)
-
-
-@pytest.mark.parametrize("n_beams", [1, 5, 64])
-def test_any_number_of_beams_is_that_of_xla(plan, n_beams):
-    check_same(plan, "pockets", n_beams)
-
-
 def test_blocks_of_many_segments_and_windows_of_few_blocks_are_those_of_xla(plan_of):
     plan = plan_of(tunnels.tunnel_arrays(tunnels.straight(12.0), roughness=0.015, correlation=0.1))
     tunnel, poses = Tunnel.from_plan(plan, "smooth", block_length=8.0, max_segments=50), poses_in(plan, 300)

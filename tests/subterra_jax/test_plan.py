@@ -97,13 +97,6 @@ def test_a_digest_tells_tunnels_apart_and_is_that_of_the_file_where_there_is_one
     assert tunnel_digest("open:val:1") == tunnel_digest("open:val:1")
 
 
-def test_the_packaged_tunnels_load_by_name():
-    assert st.load_tunnel().name == st.load_tunnel("subterra-351").name == "subterra-351"
-    metro = st.load_tunnel("metro")
-    assert metro.provenance == "measured"
-    assert metro.length == pytest.approx(1283.7, abs=0.2)
-
-
 def test_the_packaged_pockets_cross_the_plane_of_the_lidar_on_both_walls():
     plan = st.load_tunnel()
     depth = 0.13

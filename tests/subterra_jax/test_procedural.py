@@ -109,14 +109,6 @@ def test_where_no_tunnel_is_named_it_is_the_open_worlds_and_the_papers_for_the_p
         st.make("Subterra/B2Walk-v1", split="val")
 
 
-@pytest.mark.parametrize("split", ["train", "test-unseen"])
-def test_the_tunnels_of_a_split_are_of_all_its_kinds_alike(split):
-    _, params = st.make("Subterra/StopAtShort-v1", split=split)
-    assert params.tunnel.count == 12
-    own = resolve(f"open:{split}:7", None, None, 30.0)
-    assert float(params.tunnel.pick(7).length) == float(own.length)
-
-
 def afresh(name="open:cast:val:5", length=60.0) -> st.Tunnel:
     """A tunnel as another process has it."""
     sources._named.cache_clear()

@@ -74,13 +74,6 @@ def test_the_ellipse_reaches_two_standard_deviations_and_is_as_wide_as_the_parti
     np.testing.assert_allclose(drawn.particles(3)[:, :2], [[0.0, 0.5], [0.0, 1.5]])
 
 
-def test_the_ellipse_follows_a_bend(plan_of):
-    bend = Centreline(plan_of(tunnels.tunnel_arrays(tunnels.arc(60.0, 40.0))))
-    points = straight(bend, estimate=np.tile([30.0, 10.0], (21, 1))).ellipse(5).reshape(-1, 3)
-    away = np.sqrt(((points[:, None, :2] - bend.plan.centre) ** 2).sum(-1)).min(axis=1)
-    assert away.max() < 0.5
-
-
 def test_the_gate_stands_at_the_goal_and_is_as_wide_as_the_tunnel(centreline):
     gate = straight(centreline).gate().reshape(-1, 3)
     np.testing.assert_allclose(gate[:, 0], 40.0, atol=1e-6)

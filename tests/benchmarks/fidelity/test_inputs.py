@@ -80,12 +80,6 @@ def test_a_tunnel_shorter_than_a_window_is_refused() -> None:
 CONFIG = SplitConfig()
 
 
-def test_each_hand_of_five_blocks_holds_the_shares() -> None:
-    dealt = deal_blocks(100.0, CONFIG)
-    hands = dealt[: len(dealt) // 5 * 5].reshape(-1, 5)
-    assert {tuple(np.bincount(hand, minlength=3)) for hand in hands} == {(3, 1, 1)}
-
-
 def test_times_near_a_border_between_parts_belong_to_nobody() -> None:
     dealt = np.array([0, 2, 2, 1, 0])
     assert part_at(1.85, dealt, CONFIG) == 0

@@ -11,20 +11,17 @@ import trimesh
 from benchmarks.fidelity.candidate import load_candidate
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.categories import scene as scene_metrics
+from benchmarks.fidelity.derive.lining import judged_pockets
 from tests.benchmarks.fidelity import tube, tubescene
-from tests.benchmarks.fidelity.judged import SHORT, against, measure, raw
+from tests.benchmarks.fidelity.judged import PLAIN, SHORT, against, measure, raw
 from tests.benchmarks.fidelity.tube import Tube
 
 short = partial(against, SHORT)
 
 
-def test_a_pillar_is_a_loop_that_the_other_diagram_has_not() -> None:
-    turn = np.eye(4)
-    turn[:3, :3] = np.column_stack([axis[0] for axis in SHORT.frames(6.1)[1:]])
-    turn[:3, 3] = SHORT.point(6.1, 0.0, 0.0)[0]
-    pillar = trimesh.creation.box((0.4, 0.4, 8.0), transform=turn)
-    assert raw("topo_bottleneck_h1", short()) == pytest.approx(0.0, abs=1e-9)
-    assert raw("topo_bottleneck_h1", tube.corrupted(short(), extra=pillar)) > 0.3
+def test_every_pocket_of_a_true_copy_is_found_and_without_any_their_error_has_failed() -> None:
+    assert len(judged_pockets(against(PLAIN))) == len(PLAIN.pockets)
+    assert measure("lin_pocket_depth_bias", against(PLAIN, depth=0.0)).failed
 
 
 def test_rails_10_cm_farther_out_give_the_footprint_10_cm_more_room() -> None:

@@ -34,21 +34,6 @@ def test_the_null_tube_is_one_section_along_the_right_axis(case: Case) -> None:
     assert len(null.bore.pocket) == 0
 
 
-def test_the_null_tube_faces_the_axis(case: Case) -> None:
-    null = null_tube(case.candidate)
-    middle = case.candidate.bore.position[np.argmin(
-        np.linalg.norm(case.candidate.bore.position[None] - null.lining.triangles_center[:, None], axis=2), axis=1
-    )]  # fmt: skip
-    inward = np.einsum("ij,ij->i", null.lining.face_normals, middle - null.lining.triangles_center)
-    assert (inward > 0).all()
-
-
-def test_without_sleepers_nothing_of_the_track_is_left(case: Case) -> None:
-    assert len(case.candidate.track.sleeper) > 0
-    track = null_tube(case.candidate, sleepers=False).track
-    assert len(track.sleeper) == len(track.rail_mesh.faces) == len(track.rail["left"]) == 0
-
-
 def test_the_null_tube_knows_nothing_of_pockets_and_variation(case: Case) -> None:
     null = judged(case, null_tube(case.candidate))
     for id in ("sec_variation_ratio", "sec_variation_corr", "lin_pocket_f1", "lin_depth_map_ncc"):

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from benchmarks.fidelity import table
-from benchmarks.fidelity.case import _KEPT_UNTIL
 from benchmarks.fidelity.derive.sections import truth_caster
 from benchmarks.fidelity.derive.surface import surface_nearest
 from benchmarks.fidelity.registry import dump_values, estimate, load_values, mean
@@ -87,21 +86,6 @@ def test_what_no_later_category_needs_is_let_go_and_comes_back_the_same() -> Non
     assert truth_caster(case) is not of_truth
     for found, known in zip(surface_nearest(case).query(POINTS), expected, strict=True):
         np.testing.assert_array_equal(found, known)
-
-
-def test_what_comes_back_after_its_category_goes_with_the_one_that_asked() -> None:
-    case = tube.case().fresh()
-    case.forget("F3D")
-    again = surface_nearest(case)
-    case.forget("CEN")
-    assert surface_nearest(case) is again
-    case.forget("SCN")
-    assert surface_nearest(case) is not again
-
-
-def test_every_mark_names_a_category() -> None:
-    table.load()
-    assert set(_KEPT_UNTIL.values()) <= set(table.CATEGORIES)
 
 
 def test_a_fresh_case_shares_data_and_no_results() -> None:

@@ -16,7 +16,6 @@ from benchmarks.fidelity.faults.runner import (
     judge_outcomes,
     run_control,
     run_jobs,
-    without_figures,
 )
 from benchmarks.fidelity.inputs import Inputs
 from benchmarks.fidelity.judge import Judgement
@@ -116,11 +115,6 @@ def test_an_invariance_that_moves_a_category_is_loud(share: float) -> None:
     assert judge.loud(rows) == ["I4"]
 
 
-def test_reasons_are_compared_without_their_figures() -> None:
-    assert without_figures(["category F2D is 61.2, below 70"]) == without_figures(["category F2D is 12.9, below 70"])
-    assert without_figures(["category F2D is 61.2, below 70"]) != without_figures(["category F3D is 61.2, below 70"])
-
-
 def test_without_any_reference_nothing_is_asked_over_the_null_tube() -> None:
     entries = table.load()
     alone = {id: v if set(entries[id].evidence) <= set("SK") else missing("none") for id, v in values(0.98).items()}
@@ -163,15 +157,6 @@ def test_a_figure_that_cannot_be_drawn_costs_no_other(
     write_report(tmp_path, case, Inputs(), judgement, None)
     assert "F00-broken is left out: too little of the section" in capsys.readouterr().out
     assert {path.name for path in (tmp_path / "figures").iterdir()} == {"F13.png", "F13.svg"}
-
-
-def test_the_same_values_write_the_same_bytes(tmp_path: Path) -> None:
-    case = replace(tube.case(), hold=None, truth=None, cache={})
-    judgement = judge.make_judgement({"base": values(0.98), "null": values(0.7)}, [])
-    for name in ("one", "other"):
-        write_report(tmp_path / name, case, Inputs(), judgement, None)
-    for file in ("report.json", "metrics.csv", "report.html", "figures/categories.svg"):
-        assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "other" / file).read_bytes()
 
 
 def test_a_run_that_was_cut_short_goes_on_with_the_next_candidate(
