@@ -16,7 +16,6 @@ CODES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 PLAIN = [("x", "f4", 0), ("y", "f4", 4), ("z", "f4", 8)]
 VELODYNE = [*PLAIN, ("intensity", "f4", 12), ("ring", "u2", 16), ("time", "f4", 18)]
 OUSTER = [*PLAIN, ("intensity", "f4", 16), ("t", "u4", 20), ("ring", "u1", 26)]
-HESAI = [*PLAIN, ("timestamp", "f8", 16)]
 
 
 class _Out:
