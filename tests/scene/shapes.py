@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tests.scene.clouds import d_section
+
 WIDTH, HEIGHT = 5.0, 5.5
 PLACE = np.array([1000.0, 2000.0, 30.0])
 
@@ -61,13 +63,9 @@ class Tube:
     def surface(self, rng: np.random.Generator) -> np.ndarray:
         start, length, along, left = self._frame()
         count = int(length * 1000 * self.width / WIDTH)
-        radius, wall = self.width / 2, self.height - self.width / 2
-        girth = np.array([self.width, wall, np.pi * radius, wall])
-        piece, at = rng.choice(4, count, p=girth / girth.sum()), rng.random(count)
-        y = np.choose(piece, [self.width * (at - 0.5), -radius, radius * np.cos(np.pi * at), radius])
-        z = np.choose(piece, [0 * at, wall * at, wall + radius * np.sin(np.pi * at), wall * at])
+        y, z = d_section(self.width, self.height, count, rng).T
         plan = start + rng.random((count, 1)) * length * along + y[:, None] * left
-        return np.column_stack([plan, z])
+        return np.column_stack([plan, z + self.height / 2])
 
     def holds(self, points: np.ndarray) -> np.ndarray:
         start, length, along, left = self._frame()

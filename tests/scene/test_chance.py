@@ -8,19 +8,22 @@ from scene.fitting import evidence, pockets, trackseen
 from scene.fitting.evidence import more_than_chance, steadier_than_chance
 from tests.scene.clouds import curved_d_bore
 from tests.scene.fits import fitted, thin
-from tests.scene.scanned import arch, pillar, scan, with_outliers
+from tests.scene.railway import World, arch, stations, terrestrial
+from tests.scene.shapes import PLACE
 
 PITCHES = (0.9, 2.1)
 
 
 def pillared() -> np.ndarray:
-    row = [pillar(x, y, 0.2) for x in np.arange(3, 24, 3.0) for y in (-2.5, 2.5)]
-    return scan([arch(9, 7, 24), *row], np.arange(2, 24, 6.0), 200_000)
+    row = [(x - 0.2, x + 0.2, y - 0.2, y + 0.2, 0.0, 6.0) for x in np.arange(3, 24, 3.0) for y in (-2.5, 2.5)]
+    world = World(arch(9.0, 7.0, 2.5), 24.0, row, grade=0.0)
+    return world.scan(terrestrial(), stations(24.0), noise=0.005) - PLACE
 
 
 def strewn() -> np.ndarray:
-    known = curved_d_bore(60, per_metre=4000, radius=1e6, grade=0.0, yaw=0.0, offset=(0.0, 0.0, 0.0))
-    return with_outliers(known.points, 0.01)
+    points = curved_d_bore(60, per_metre=4000, radius=1e6, grade=0.0, yaw=0.0, offset=(0.0, 0.0, 0.0)).points
+    low, high = points.min(axis=0) - 3.0, points.max(axis=0) + 3.0
+    return np.concatenate([points, np.random.default_rng(1).uniform(low, high, (len(points) // 100, 3))])
 
 
 @pytest.mark.parametrize(

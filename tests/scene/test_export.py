@@ -92,8 +92,7 @@ def load_sdf(path) -> trimesh.Trimesh:
 
 
 @pytest.mark.parametrize(
-    ("to", "name", "load"),
-    [("glb", "arc.glb", load_glb), ("usd", "arc.usdc", load_usd), ("sdf", "arc", load_sdf)],
+    ("to", "name", "load"), [("glb", "arc.glb", load_glb), ("usd", "arc.usdc", load_usd), ("sdf", "arc", load_sdf)]
 )
 def test_rays_meet_the_export_where_they_meet_the_mjcf(scene, rays, tmp_path, to, name, load):
     out = tmp_path / name

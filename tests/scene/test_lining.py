@@ -118,12 +118,7 @@ def test_a_wall_seen_too_thinly_gets_the_standard_lining_on_request_marked_so(tm
     [("auto", False, False), ("auto", True, True), ("none", True, False), ("standard", False, True)],
 )
 def test_the_standard_lining_stands_in_a_railway_or_on_request(bore, lay, railway, some):
-    round_bore = replace(
-        bore,
-        radius=np.full_like(bore.radius, 2.8),
-        ring_station=np.empty(0),
-        pocket=bore.pocket[:0],
-    )
+    round_bore = replace(bore, radius=np.full_like(bore.radius, 2.8), ring_station=np.empty(0), pocket=bore.pocket[:0])
     lined, provenance = add_standard_lining(round_bore, LiningConfig(lay=lay), False, railway=railway)
     assert (len(lined.pocket) > 0) == (len(lined.ring_station) > 0) == some
     assert provenance["pockets"] == ("by standard" if some else "none: the survey cannot show them")

@@ -198,10 +198,7 @@ def test_every_file_that_can_hold_one_has_the_crs_of_the_input(tmp_path):
 
 def test_nothing_in_the_bore_is_named_where_the_poses_scatter_the_returns():
     said = [
-        Warned(
-            Code.UNEXPLAINED,
-            "7% lie further than 10 cm, most from 0 to 2 m, where it looks like a train",
-        ),
+        Warned(Code.UNEXPLAINED, "7% lie further than 10 cm, most from 0 to 2 m, where it looks like a train"),
         Warned(Code.PLACE, "at 3 m: a train"),
         Warned(Code.UNSEEN, "a guess"),
     ]

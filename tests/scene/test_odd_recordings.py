@@ -42,10 +42,7 @@ ODD = {
     "all one time": (lambda path: clouds(path, [5.0] * 9), ""),
     "backwards": (lambda path: clouds(path, [9.0, 8.0, 7.0]), "the times of /points do not grow: scan 2 is of 7.000"),
     "a leap of a day": (lambda path: clouds(path, [5.0, 86405.0]), "86400 s after the one before it"),
-    "NaN times": (
-        lambda path: clouds(path, [5.0, 5.1], fields=VELODYNE, step=22, time=np.full(300, np.nan)),
-        "",
-    ),
+    "NaN times": (lambda path: clouds(path, [5.0, 5.1], fields=VELODYNE, step=22, time=np.full(300, np.nan)), ""),
     "times of hours": (
         lambda path: clouds(path, [5.0, 5.1], fields=VELODYNE, step=22, time=np.geomspace(1e-3, 1e20, 300)),
         r"scan 0 of /points is a sweep whose `time` spans",
@@ -115,10 +112,7 @@ def test_inertial_samples_in_no_known_unit_are_named(tmp_path):
     bag = write_imu_bag(tmp_path / "a.bag", XYZ, 60)
     one, feet = (np.array([0.0, 0, value]).astype("<f8").tobytes() for value in (1.0, 32.2))
     bag.write_bytes(bag.read_bytes().replace(one + bytes(72), feet + bytes(72)))
-    with (
-        Recording(bag) as recording,
-        pytest.raises(RecordingError, match=r"force of 32\.2, which is neither"),
-    ):
+    with Recording(bag) as recording, pytest.raises(RecordingError, match=r"force of 32\.2, which is neither"):
         read_inertial(recording, "/livox/imu")
 
 

@@ -27,9 +27,7 @@ def _random_blocks(n, key=1):
     evidence = 2.0 * rng.standard_normal((n, len(matching.SHARES)))
     evidence[:DELAY] = 0.0
     return Block(
-        jnp.asarray(evidence, jnp.float32),
-        jnp.asarray(0.03 * rng.standard_normal(n), jnp.float32),
-        jnp.full(n, 5.0),
+        jnp.asarray(evidence, jnp.float32), jnp.asarray(0.03 * rng.standard_normal(n), jnp.float32), jnp.full(n, 5.0)
     )
 
 

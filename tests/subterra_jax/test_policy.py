@@ -232,12 +232,7 @@ def test_board_and_recorder_drive_with_each_of_them(places):
         ("empty", TASK, PolicyError, r"empty: holds no policy.safetensors; release it again"),
         ("nobody", None, AgentError, r"no agent 'nobody'; there are random, .*; or policy:NAME"),
         ("scan-matching", None, PolicyError, r"scan-matching: drives any task, so name one"),
-        (
-            "TraverseShort-v1",
-            TASK,
-            PolicyError,
-            r"TraverseShort-v1: (has learnt|reads)",
-        ),
+        ("TraverseShort-v1", TASK, PolicyError, r"TraverseShort-v1: (has learnt|reads)"),
         ("B2Walk-v1", TASK, PolicyError, r"made for observations of 56 numbers, the B2 gives 21"),
         ("pathlib:Path", TASK, AgentError, r"agent 'pathlib:Path' has no uses_lidar"),
     ],

@@ -117,13 +117,20 @@ def test_another_run_that_was_killed_before_its_first_checkpoint_is_not_gone_on_
     assert "config.json: cannot be read; --overwrite begins anew" in capsys.readouterr().err
 
 
-def test_a_run_that_was_killed_after_its_last_checkpoint_is_scored(whole, train_small, tmp_path):
+@pytest.mark.parametrize("lost", [(), ("00000003",)], ids=["the last", "the one before"])
+def test_a_run_that_was_killed_after_a_checkpoint_goes_on_bit_for_bit_and_is_scored(whole, train_small, tmp_path, lost):
     out = tmp_path / "run"
     shutil.copytree(whole, out)
     (out / "evaluation.json").unlink()
+    for name in lost:  # as if killed after logging an iteration that no checkpoint knows, and half of the next
+        shutil.rmtree(out / "checkpoint" / name)
+        with (out / "log.jsonl").open("a") as log:
+            log.write('{"iteration": 4, "half a li')
     assert train_small(*FEW, "--resume", out=out)[0] == 0
-    assert (out / "evaluation.json").exists()
     assert log_without_timing(out) == log_without_timing(whole)
+    for name in ("episodes.csv", "curve.csv", "evaluation.json"):
+        assert (out / name).read_bytes() == (whole / name).read_bytes(), name
+    assert digest(out) == digest(whole)
 
 
 def test_a_checkpoint_stays_whole_while_it_is_written_again(whole, tmp_path):

@@ -14,12 +14,7 @@ from subterra_jax.b2 import gait as gaits
 from subterra_jax.host.errors import OutputError
 from subterra_jax.policies.files import PolicyError
 from train import walk
-from train.b2.walking import (
-    WalkConfig,
-    WalkDriver,
-    make_walk_config,
-    score,
-)
+from train.b2.walking import WalkConfig, WalkDriver, make_walk_config, score
 from train.config import ConfigError
 from train.driver import Policy
 from train.policies import write_tensors

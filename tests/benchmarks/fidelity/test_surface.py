@@ -8,13 +8,7 @@ import trimesh
 
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.derive.beams import returns, sensor_path
-from benchmarks.fidelity.derive.distances import (
-    VOXEL_EDGE,
-    Occupied,
-    mesh_distances,
-    phantom_cells,
-    tolerant_f1,
-)
+from benchmarks.fidelity.derive.distances import VOXEL_EDGE, Occupied, mesh_distances, phantom_cells, tolerant_f1
 from benchmarks.fidelity.derive.surface import Nearest
 from benchmarks.fidelity.faults import Fault, Site, put_in
 from tests.benchmarks.fidelity import tube

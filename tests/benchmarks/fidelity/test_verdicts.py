@@ -9,14 +9,7 @@ import pytest
 
 from benchmarks.fidelity import judge, scoring, table
 from benchmarks.fidelity.case import Case
-from benchmarks.fidelity.faults.runner import (
-    Bench,
-    Job,
-    Outcome,
-    judge_outcomes,
-    run_control,
-    run_jobs,
-)
+from benchmarks.fidelity.faults.runner import Bench, Job, Outcome, judge_outcomes, run_control, run_jobs
 from benchmarks.fidelity.inputs import Inputs
 from benchmarks.fidelity.judge import Judgement
 from benchmarks.fidelity.registry import Value, missing
@@ -124,10 +117,7 @@ def test_without_any_reference_nothing_is_asked_over_the_null_tube() -> None:
 
 def test_all_forms_are_written_and_agree(tmp_path: Path) -> None:
     case = replace(tube.case(), hold=None, truth=None, cache={})
-    made = {
-        "base": {**values(0.98), "c2m_mean": missing("no held-out recording")},
-        "null": values(0.7),
-    }
+    made = {"base": {**values(0.98), "c2m_mean": missing("no held-out recording")}, "null": values(0.7)}
     controls = judge_outcomes([outcome("N24", 1.445, values(0.98, ("TRK",), 0.3))], base())
     judgement = judge.make_judgement(made, [], controls)
     write_report(tmp_path, case, Inputs(out=tmp_path), judgement, controls)

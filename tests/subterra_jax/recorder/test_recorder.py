@@ -122,10 +122,7 @@ def test_the_recording_tells_neither_seed_nor_truth(config, trace):
 def test_the_same_config_gives_the_same_bytes(config, trace, tmp_path):
     again = dataclasses.replace(config, out=tmp_path / "again")
     record(again)
-    for folder, other in (
-        (config.recording_folder, again.recording_folder),
-        (config.truth_folder, again.truth_folder),
-    ):
+    for folder, other in ((config.recording_folder, again.recording_folder), (config.truth_folder, again.truth_folder)):
         for path in folder.iterdir():
             assert path.read_bytes() == (other / path.name).read_bytes(), path.name
 

@@ -6,13 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import subterra_jax as st
-from subterra_jax.recorder.sensors import (
-    GRAVITY,
-    Poses,
-    measure_imu,
-    reckoned_poses,
-    true_poses,
-)
+from subterra_jax.recorder.sensors import GRAVITY, Poses, measure_imu, reckoned_poses, true_poses
 from subterra_jax.recorder.trace import Trace
 from subterra_jax.state import State
 
