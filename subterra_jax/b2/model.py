@@ -5,7 +5,7 @@ import mujoco
 from subterra_jax.b2 import constants as b2
 from subterra_jax.b2.shape import shape_of
 from subterra_jax.host.rover import GROUND, LOW_WALL
-from subterra_jax.physics.engine import TIMESTEP, Machine
+from subterra_jax.physics.engine import Machine, set_options
 
 _BOX, _SPHERE = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_SPHERE
 _ROBOT, _HIDDEN = 2, 3  # groups of what is drawn and of what MuJoCo does not draw unless asked to
@@ -17,7 +17,7 @@ def robot_spec() -> mujoco.MjSpec:
     spec = mujoco.MjSpec()
     spec.modelname = "b2"
     spec.compiler.degree = False
-    _set_options(spec)
+    set_options(spec)
     trunk = spec.worldbody.add_body(name="base_link")
     trunk.add_freejoint(name="base")
     _set_inertia(trunk, b2.TRUNK)
@@ -44,15 +44,6 @@ def dress(spec: mujoco.MjSpec) -> None:
                 name=own, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=own, mass=0.0, contype=0, conaffinity=0,
                 group=_ROBOT, rgba=(*part.colour, 1.0),
             )  # fmt: skip
-
-
-def _set_options(spec: mujoco.MjSpec) -> None:
-    """Sets one Newton iteration with a short line search, warm-started: enough for contacts of the feet."""
-    option = spec.option
-    option.timestep, option.iterations, option.ls_iterations = TIMESTEP, 1, 5
-    option.integrator, option.cone = mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtCone.mjCONE_PYRAMIDAL
-    # The servos damp within the torque limit: an implicit step would not help.
-    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
 
 
 def _set_inertia(body: mujoco.MjsBody, inertial: b2.Inertial) -> None:

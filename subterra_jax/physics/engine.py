@@ -27,6 +27,15 @@ PREFIX = "robot/"  # of the robot's names in a scene
 _ITERATIONS, _LINE_SEARCH = 10, 20  # of the solver in C: accuracy costs little on one robot
 
 
+def set_options(spec: mujoco.MjSpec) -> None:
+    """Set one Newton iteration with a short line search, warm-started: enough for the contacts of one robot."""
+    option = spec.option
+    option.timestep, option.iterations, option.ls_iterations = TIMESTEP, 1, 5
+    option.integrator, option.cone = mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtCone.mjCONE_PYRAMIDAL
+    # No second factorisation for damping: servos damp within their torque limit, or in the inertia of the joint.
+    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
+
+
 @struct.dataclass
 class Body:
     """State of the physics; positions from the anchor.
@@ -91,14 +100,10 @@ class Engine:
     Attributes:
         machine: The robot.
         substeps: Steps of physics in a control period.
-        iterations: Iterations of the solver in each step.
-        ls_iterations: Iterations of its line search.
     """
 
     machine: Machine
     substeps: int = 5
-    iterations: int = 1
-    ls_iterations: int = 5
 
     @property
     def period(self) -> float:
@@ -124,7 +129,6 @@ class Engine:
     def host(self) -> mujoco.MjModel:
         """The robot with a plane for each contact that it may have."""
         spec = self.machine.spec()
-        spec.option.iterations, spec.option.ls_iterations = self.iterations, self.ls_iterations
         for name in (*self.machine.treads, *self.machine.bumpers):
             geom = spec.geom(name)
             for k in range(N_PLANES if name in self.machine.treads else 1):
