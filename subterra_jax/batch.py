@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from subterra_jax.compiled import compiled, run_compiled
+from subterra_jax.compiled import compiled, hashable
 from subterra_jax.env import Env, Info
 
 # Those of a `TunnelEnv`, or of another `Env`: the walking robot's, say.
@@ -175,13 +175,13 @@ def rollout(
 ) -> tuple[Obs, State, dict[str, Any]]:
     """Let a policy drive for a number of steps, in one compiled program.
 
-    The program is kept: a further call with the same batch, shapes and policy compiles nothing, and neither does one
-    with other weights. Inside a function that is compiled or differentiated itself it becomes a part of that.
+    The program is kept: a further call with the same batch, shapes and policy compiles nothing. What a plain function
+    takes from outside is part of the program, as with `jax.jit`; weights that change belong into
+    `jax.tree_util.Partial(function, weights)`.
 
     Args:
         policy: Key and observations to actions `(n_envs, n_action)`, pure; or a policy with memory, from `load_policy`
-            or of one's own after `subterra_jax.policies.Policy`. Its memory begins anew with every episode. It is
-            traced once in each call.
+            or of one's own after `subterra_jax.policies.Policy`. Its memory begins anew with every episode.
         key: Source of the policy's and the environments' randomness.
         n_steps: Steps to take.
         memory: Memory to begin with, `memory` of an earlier call; None where the episodes begin here.
@@ -196,19 +196,26 @@ def rollout(
     """
     if not isinstance(n_steps, int | np.integer) or n_steps < 0:
         raise ValueError(f"n_steps must be a whole number, at least 0, got {n_steps!r}")
-    return run_compiled(partial(_roll, env, policy, n_steps), key, obs, state, params, memory)
+    leaves, tree = jax.tree.flatten(policy)
+    arrays = [leaf if isinstance(leaf, jax.Array | np.ndarray | int | float) else None for leaf in leaves]
+    fixed = env, n_steps, tree, tuple(leaf for leaf, array in zip(leaves, arrays, strict=True) if array is None)
+    run = _roll if hashable(fixed) else _roll.__wrapped__
+    return run(fixed, arrays, key, obs, state, params, memory)
 
 
+@partial(jax.jit, static_argnums=0)
 def _roll(
-    env: AutoReset,
-    policy: Policy,
-    n_steps: int,
+    fixed: tuple[AutoReset, int, Any, tuple[Any, ...]],
+    arrays: list[Any],
     key: PRNGKeyArray,
     obs: Obs,
     state: State,
     params: EnvParams,
     memory: Any,
 ) -> tuple[Obs, State, dict[str, Any]]:
+    env, n_steps, tree, others = fixed
+    rest = iter(others)
+    policy = jax.tree.unflatten(tree, [next(rest) if array is None else array for array in arrays])
     remembers = hasattr(policy, "initial_memory")
     if remembers and memory is None:
         memory = policy.initial_memory(jax.random.fold_in(key, n_steps), obs.shape[0])

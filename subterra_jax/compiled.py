@@ -1,9 +1,8 @@
-"""Compiles the methods of an environment, and policies that drive a batch, at their first use; modes of JAX."""
+"""Compiles the methods of an environment at their first use, and keeps programs on disk; modes of JAX."""
 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import functools
 import hashlib
 import platform
@@ -130,52 +129,6 @@ def hashable(value: Any) -> bool:
     return True
 
 
-def run_compiled(function: Callable[..., Any], *args: Any) -> Any:
-    """Run a function of arrays compiled; equal programs are compiled once, whatever function they come from.
-
-    The function is traced at each call. So it may take from outside what changes between calls, such as the weights of
-    a policy, and `jax.jit`'s rule that a function is the same as long as its name is does not apply. Where JAX is
-    transforming already, the function becomes a part of that.
-
-    Args:
-        function: Function of pytrees of arrays that returns one.
-    """
-    if _is_traced(args):
-        return function(*args)
-    program, shape = jax.make_jaxpr(function, return_shape=True)(*args)
-    if _is_traced(program.consts):
-        return function(*args)
-    traced = _Program(str(program.jaxpr), tuple(map(id, _held_arrays(program.jaxpr))), program.jaxpr)
-    flat = _run(traced, program.consts, jax.tree.leaves(args))
-    return jax.tree.unflatten(jax.tree.structure(shape), flat)
-
-
-@dataclasses.dataclass(frozen=True)
-class _Program:
-    """A traced function, as a static argument."""
-
-    text: str  # the program, printed
-    # identities of arrays that compiled functions inside of it hold; the program keeps them alive
-    held: tuple[int, ...]
-    program: Any = dataclasses.field(compare=False)  # the program, without the arrays that it takes from outside
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _run(traced: _Program, constants: list[Any], leaves: list[Any]) -> list[Any]:
-    return jax.core.eval_jaxpr(traced.program, constants, *leaves)
-
-
 def _is_traced(tree: Any) -> bool:
     """Tell whether an array of a pytree stands for one that a transformation of JAX will fill in."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
-
-
-def _held_arrays(program: Any) -> Iterator[Any]:
-    """Arrays inside the compiled functions that a program calls."""
-    for equation in program.eqns:
-        for value in jax.tree.leaves(list(equation.params.values()), is_leaf=lambda value: hasattr(value, "consts")):
-            if hasattr(value, "consts"):
-                yield from value.consts
-                yield from _held_arrays(value.jaxpr)
-            elif hasattr(value, "eqns"):
-                yield from _held_arrays(value)

@@ -19,73 +19,6 @@ from subterra_jax.lidar3d.finding import find, find_from
 from subterra_jax.lidar3d.relief import Relief, block_contents
 
 
-@in_32_bits()
-def scan(
-    relief: Relief,
-    position: Float[Array, "3"],
-    orientation: Float[Array, "4"],
-    station: Float[Array, ""],
-    directions: Float[Array, "*n_beams 3"],
-    range_max: Float[Array, ""] | float,
-) -> Float[Array, "*n_beams"]:
-    """Return the true ranges of one scan from one pose. For noise, see `lidar.add_noise`.
-
-    Args:
-        relief: Surface of the bore.
-        position: Position of the sensor, tunnel frame, m.
-        orientation: Rotation from the sensor's frame to the tunnel frame, unit quaternion w, x, y, z.
-        station: Station of the sensor, m, to within 2 m.
-        directions: Beams in the sensor's frame, unit vectors, `(n, 3)`, or an image `(rows, columns, 3)`, a ring a row;
-            see `beams`. NVIDIA GPUs take an image column by column, which was twice as fast in upright tunnels.
-        range_max: Largest range, m.
-
-    Returns:
-        Ranges, m, in [0, range_max]; exactly `range_max` for a beam that meets nothing, as one through a mouth.
-
-    Raises:
-        ValueError: There is no beam, or one is no number or no unit vector.
-    """
-    require_pattern(directions)
-    beams = rotate(jnp.asarray(orientation, jnp.float32), jnp.asarray(directions, jnp.float32))
-    return cast(relief, position, beams, station, range_max)
-
-
-@in_32_bits()
-def cast(
-    relief: Relief,
-    origin: Float[Array, "3"],
-    directions: Float[Array, "*n 3"],
-    station: Float[Array, ""],
-    range_max: Float[Array, ""] | float,
-) -> Float[Array, "*n"]:
-    """Return the distance along each ray to the nearest triangle.
-
-    Derivatives with respect to origin and directions are exact but at edges: those of the plane of the triangle that
-    the ray meets, 0 for a ray that meets nothing.
-
-    Args:
-        relief: Surface of the bore, or of one picked from a stack.
-        origin: Origin of all rays, tunnel frame, m.
-        directions: Unit vectors, tunnel frame, `(n, 3)` or as an image, as for `scan`.
-        station: Station of the origin, m, to within 2 m.
-        range_max: Largest range, m.
-
-    Returns:
-        Ranges, m, in [0, range_max]; exactly `range_max` for a ray that meets nothing; NaN where an argument is.
-
-    Raises:
-        ValueError: There is no ray, or a direction known beforehand is no number or no unit vector.
-    """
-    require_pattern(directions)
-    origin, station = jnp.asarray(origin, jnp.float32), jnp.asarray(station, jnp.float32)
-    directions, limit = jnp.asarray(directions, jnp.float32), jnp.asarray(range_max, jnp.float32)
-    block = block_at(relief, origin, station)
-    if directions.ndim == 3:
-        return _meet(relief.shared, origin, directions, block, limit)[0]
-    origins, blocks, limits = (jnp.broadcast_to(x, (len(directions), *x.shape)) for x in (origin, block, limit))
-    return _meet(relief.shared, origins, directions, blocks, limits)[0]
-
-
 class Met(NamedTuple):
     """Surfaces that rays meet, `n` of them or an image."""
 
@@ -101,17 +34,27 @@ def meet(
     origins: Float[Array, "n 3"] | Float[Array, "3"],
     directions: Float[Array, "n 3"] | Float[Array, "rows columns 3"],
     station: Float[Array, ""],
-    limits: Float[Array, "n"] | Float[Array, ""],
+    limits: Float[Array, "n"] | Float[Array, ""] | float,
 ) -> Met:
-    """Return the surfaces that rays meet. Ranges have derivatives as those of `cast`.
+    """Return the surfaces that rays meet, without noise.
+
+    Derivatives of the ranges are exact but at edges: those of the plane of the triangle that the ray meets, 0 for a ray
+    that meets nothing.
 
     Args:
         relief: Surface of the bore, or of one picked from a stack.
-        origins: Origins, one for each ray or one for all, tunnel frame, m, within 2 m of the station.
-        directions: Unit vectors, tunnel frame; not checked. Those of one origin row by row of an image, a ring a row.
+        origins: Origins, one for each ray or one for an image, tunnel frame, m, within 2 m of the station.
+        directions: Unit vectors, tunnel frame, `(n, 3)`, or an image, a ring a row; see `beams`.
+            NVIDIA GPUs take an image column by column, which was twice as fast in upright tunnels.
         station: Station of the origins, m.
-        limits: Largest ranges, m; one for all rays if they have one origin.
+        limits: Largest ranges, m.
+
+    Returns:
+        Ranges in [0, limit], exactly `limit` for a ray that meets nothing, as one through a mouth; NaN where an
+        argument is.
     """
+    origins, directions = jnp.asarray(origins, jnp.float32), jnp.asarray(directions, jnp.float32)
+    limits = jnp.asarray(limits, jnp.float32)
     if directions.ndim == 3:
         block = block_at(relief, origins, jnp.asarray(station, jnp.float32))
         return Met(*_meet(relief.shared, origins, directions, block, limits))
@@ -151,24 +94,15 @@ def _meet_and_changes(primals: Any, tangents: Any) -> tuple[Any, Any]:
     return (ranges, normal, thing), (change, jnp.zeros_like(normal), np.zeros(thing.shape, jax.dtypes.float0))
 
 
-def require_pattern(directions: Any, axes: tuple[int, ...] = (2, 3)) -> None:
-    """Check beams, as far as they are known before the program runs.
-
-    Args:
-        directions: Unit vectors.
-        axes: Numbers of axes that they may have.
+def require_pattern(directions: np.ndarray) -> None:
+    """Check beams, unit vectors `(n, 3)`.
 
     Raises:
         ValueError: There is no beam, or one is no number or no unit vector.
     """
-    if jnp.ndim(directions) not in axes or directions.shape[-1] != 3 or not directions.size:
-        shapes = " or ".join({2: "(n, 3)", 3: "(rows, columns, 3)"}[n] for n in axes)
-        raise ValueError(
-            f"a pattern needs one or more beams as unit vectors {shapes}, got shape {jnp.shape(directions)}"
-        )
-    if isinstance(directions, jax.core.Tracer):
-        return
-    size = np.linalg.norm(np.asarray(directions, np.float64).reshape(-1, 3), axis=1)
+    if directions.ndim != 2 or directions.shape[-1] != 3 or not directions.size:
+        raise ValueError(f"a pattern needs one or more beams as unit vectors (n, 3), got shape {directions.shape}")
+    size = np.linalg.norm(directions.astype(np.float64), axis=1)
     if not np.all(np.isfinite(size)):
         raise ValueError(f"beam {int(np.argmin(np.isfinite(size)))} of the pattern is no number")
     if np.any(off := np.abs(size - 1.0) > 1e-3):
@@ -246,13 +180,3 @@ def block_at(relief: Relief, origin: Float[Array, "3"], station: Float[Array, ""
     local = jnp.sum(row[3:12].reshape(3, 3) * (origin - row[:3]), axis=1)
     ahead, behind = jnp.sum(row[16:19] * local) > row[19], jnp.sum(row[12:15] * local) < row[15]
     return relief.first_block + jnp.clip(at + ahead.astype(jnp.int32) - behind.astype(jnp.int32), 0, last)
-
-
-def rotate(orientation: Float[Array, "4"], vectors: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
-    """Rotate vectors by a unit quaternion w, x, y, z."""
-    w, x, y, z = orientation[0], orientation[1], orientation[2], orientation[3]
-    a, b, c = vectors[..., 0], vectors[..., 1], vectors[..., 2]
-    # v + 2 q × (q × v + w v)
-    p, q, r = y * c - z * b + w * a, z * a - x * c + w * b, x * b - y * a + w * c
-    turned = [a + 2.0 * (y * r - z * q), b + 2.0 * (z * p - x * r), c + 2.0 * (x * q - y * p)]
-    return jnp.stack(turned, axis=-1)

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 from subterra_jax.lidar3d.cells import N_FACES, N_WEDGES, STEP_BITS, X_BITS, Cells, sort_triangles
 from subterra_jax.lidar3d.rolled import raise_shell
 from subterra_jax.lidar3d.surface import Axis, Triangles
-from subterra_jax.lidar3d.upright import CROWN, raise_walls
+from subterra_jax.lidar3d.upright import raise_walls
 from subterra_jax.tunnel.plan import TunnelPlan
 
 # Numbers of a block: origin (3, m), axes as rows (9), planes of its two ends as normal and offset in that frame (4 and
@@ -21,6 +21,7 @@ from subterra_jax.tunnel.plan import TunnelPlan
 N_FRAME = 25 + N_FACES
 # Whole numbers of a block: the blocks behind and ahead, -1 at a mouth; first vertex, first cell, first box, boxes.
 N_LINK = 6
+BLOCK_LENGTH = 4.0  # m, about
 ARRAYS = ("frame", "link", "cell", "entry", "vertex", "box")
 
 
@@ -55,7 +56,7 @@ class Relief:
     n_x: int = struct.field(pytree_node=False)
 
     @classmethod
-    def from_plan(cls, plan: TunnelPlan, lining: str | None = None, *, crown: float = CROWN) -> "Relief":
+    def from_plan(cls, plan: TunnelPlan, lining: str | None = None) -> "Relief":
         """Put a tunnel on the device; takes some seconds per kilometre.
 
         A plan with a shell gives the bore as surveyed, with recesses, track and furniture. One without knows its walls
@@ -64,29 +65,27 @@ class Relief:
 
         Args:
             lining: Variant of its walls; `None` is `pockets`, or the first if there is none of that name.
-            crown: Height of the crown above the ground, m; of a plan without a shell.
 
         Raises:
-            TunnelError: The plan does not have the lining, or the crown is not above its LiDAR.
+            TunnelError: The plan does not have the lining, or has no shell and a LiDAR above the assumed crown.
         """
         if plan.shell is not None:
             return cls.from_triangles(*raise_shell(plan.shell, lining or plan.default_lining))
-        return cls.from_triangles(*raise_walls(plan, lining, crown))
+        return cls.from_triangles(*raise_walls(plan, lining))
 
     @classmethod
-    def from_triangles(cls, axis: Axis, surface: Triangles, *, block_length: float = 4.0, n_x: int = 12) -> "Relief":
+    def from_triangles(cls, axis: Axis, surface: Triangles, n_x: int = 12) -> "Relief":
         """Put a surface around an axis on the device.
 
         Args:
             axis: The axis; beyond its ends, the mouths, a ray hits nothing.
-            block_length: Target length of a block, m; affects speed and memory alone.
             n_x: Cells of a block along the axis; affects speed and memory alone.
 
         Raises:
             ValueError: No triangle lies along the axis.
             TunnelError: A quarter of a metre of the bore has too many triangles.
         """
-        cells = sort_triangles(axis, surface, block_length, n_x)
+        cells = sort_triangles(axis, surface, BLOCK_LENGTH, n_x)
         n_blocks = len(cells.low)
         return cls(
             length=_put(axis.station[-1], np.float32),

@@ -82,7 +82,7 @@ def make_sensor(sensor: Any, **changes: Any) -> SpatialParams:
         ValueError: There is no such sensor or field, or the beams are none.
     """
     if not isinstance(sensor, str):
-        require_pattern(rays := np.asarray(sensor, np.float32), (2,))
+        require_pattern(rays := np.asarray(sensor, np.float32))
         made = SpatialParams(jnp.asarray(rays), jnp.zeros(len(rays)), 30.0, shape=(1, len(rays)))
     elif sensor not in _MADE:
         raise ValueError(f"no sensor {sensor!r}; there are {', '.join(SENSORS)}, and unit vectors (n, 3)")

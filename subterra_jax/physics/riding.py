@@ -8,8 +8,9 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
+from subterra_jax import lidar3d
 from subterra_jax.lidar import LidarParams, cast
-from subterra_jax.lidar3d import beams, casting
+from subterra_jax.lidar3d import beams
 from subterra_jax.lidar3d.relief import Relief
 from subterra_jax.lidar3d.space import into_tunnel, turned
 from subterra_jax.parts import Drive, Moved, PlanarLidar, SensingState, SpatialLidar, Unicycle
@@ -234,10 +235,9 @@ def scan(
     Returns:
         True ranges, m, in [0, range_max]; exactly `range_max` where a beam meets nothing within it.
     """
-    directions = jnp.asarray(beams.planar(sensor.n_beams), jnp.float32)
+    directions = jax.vmap(rotate, (None, 0))(turn, jnp.asarray(beams.planar(sensor.n_beams), jnp.float32))
     if relief is not None:
-        return casting.scan(relief, origin, turn, sensing.station, directions, sensor.range_max)
-    directions = casting.rotate(turn, directions)
+        return lidar3d.meet(relief, origin, directions[None], sensing.station, sensor.range_max).ranges[0]
     up = rotate(track.quaternion[anchor], jnp.array([0.0, 0.0, 1.0]))
     height = jnp.sum((origin - track.position[anchor]) * up) + track.protrusion[anchor]
     nearest = jnp.minimum(_walls(origin, directions, sensing), _ground(height, up, directions))

@@ -1,8 +1,11 @@
-"""Surfaces with known geometry around an axis, and float64 brute force in them; shares no code with the simulator."""
+"""Surfaces with known geometry, float64 brute force in them by no code of the simulator, and the simulator's ranges."""
 
 from __future__ import annotations
 
+import jax.numpy as jnp
 import numpy as np
+
+from subterra_jax import lidar3d
 
 Surface = tuple[np.ndarray, np.ndarray]  # vertices (v, 3) m, faces (f, 3)
 
@@ -73,3 +76,8 @@ def brute(surface: Surface, origin: np.ndarray, direction: np.ndarray) -> np.nda
         distance = np.sum(normal * v[inside, 0], axis=1)[~flat] / along[~flat]
         reach[k] = distance[distance >= 0.0].min(initial=np.inf)
     return reach
+
+
+def ranges(relief, origin, directions, station, limit=30.0):
+    """Ranges of rays from one place."""
+    return lidar3d.meet(relief, jnp.broadcast_to(origin, directions.shape), directions, station, limit).ranges

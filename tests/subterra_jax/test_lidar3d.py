@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import subterra_jax as st
 from subterra_jax import lidar3d, native
@@ -27,7 +28,7 @@ TRACES = []
 @jax.jit
 def device_cast(relief, origin, direction, station, range_max):
     TRACES.append(1)
-    return jax.vmap(lidar3d.cast, (None, 0, 0, 0, None))(relief, origin, direction, station, range_max)
+    return jax.vmap(surfaces.ranges, (None, 0, 0, 0, None))(relief, origin, direction, station, range_max)
 
 
 def cast(relief, origin, direction, range_max=30.0, station=None) -> np.ndarray:
@@ -75,9 +76,7 @@ def random_directions(rng: np.random.Generator, *shape: int) -> np.ndarray:
 def test_a_tilted_sensor_off_the_axis_meets_the_tube_where_the_quadratic_says(reliefs):
     rng = np.random.default_rng(1)
     angle = np.deg2rad(rng.uniform(-20, 20, 2))
-    half = np.concatenate([[np.cos(angle[0] / 2)], np.sin(angle[0] / 2) * np.array([0.0, 1.0, 0.0])])
-    turned = np.asarray(lidar3d.rotate(jnp.asarray(half, jnp.float32), jnp.asarray(beams.planar(N_BEAMS))))
-    np.testing.assert_allclose(turned[0], [np.cos(angle[0]), 0.0, -np.sin(angle[0])], atol=1e-6)
+    turned = Rotation.from_euler("y", angle[0]).apply(beams.planar(N_BEAMS))
     origin = np.array([30.0, 0.7, -0.4])
     ranges = cast(reliefs["tube"], origin, turned[None])[0]
     (_, y, z), (_, dy, dz) = origin, turned.T.astype(float)
@@ -242,7 +241,7 @@ def test_derivatives_are_those_of_finite_differences_off_the_edges(bend, reliefs
     origin, way, station = bend_rays(bend[0] if name == "bend" else surfaces.axis_of(LENGTH), 5000, 8)
 
     def reach(o, d, s):
-        return lidar3d.cast(reliefs[name], o, d[None], s, 30.0)[0]
+        return surfaces.ranges(reliefs[name], o, d[None], s)[0]
 
     reaches = jax.jit(jax.vmap(reach))
     value = np.asarray(reaches(origin, way, station))
@@ -272,11 +271,12 @@ def test_the_page_finds_a_pose_by_descending_on_one_scan():
 
 
 def test_an_image_of_beams_has_the_ranges_and_derivatives_of_its_beams(reliefs):
-    place, turn = jnp.array([31.0, 0.2, -0.1]), jnp.array([1.0, 0.0, 0.0, 0.0])
+    place = jnp.array([31.0, 0.2, -0.1])
     beam = jnp.asarray(beams.spinning(np.linspace(-0.3, 0.3, 4), 16), jnp.float32)
 
     def ranges(place, beam):
-        return lidar3d.scan(reliefs["things"], place, turn, place[0], beam, 30.0)
+        origins = place if beam.ndim == 3 else jnp.broadcast_to(place, beam.shape)
+        return lidar3d.meet(reliefs["things"], origins, beam, place[0], 30.0).ranges
 
     image, flat = ranges(place, beam.reshape(4, 16, 3)), ranges(place, beam)
     np.testing.assert_array_equal(image, np.reshape(flat, (4, 16)))

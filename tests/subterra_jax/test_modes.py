@@ -52,10 +52,10 @@ def test_the_lidar_in_three_dimensions_and_its_derivatives_run_in_it(settings, k
     if not kernels:
         monkeypatch.setattr(native, "supported", lambda: False)
 
-    def scan(position, orientation, station):
-        return lidar3d.scan(relief, position, orientation, station, jnp.asarray(beams.planar(5)), 30.0)
+    def scan(position, directions, station):
+        return surfaces.ranges(relief, position, directions, station)
 
-    where = jnp.array([6.0, 0.0, 0.0]), jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.float32(6.0)
+    where = jnp.array([6.0, 0.0, 0.0]), jnp.asarray(beams.planar(5)), jnp.float32(6.0)
     with settings():
         for function in (scan, jax.jacfwd(scan), jax.jacrev(scan), jax.vmap(scan, (None, None, None), axis_size=2)):
             assert jax.eval_shape(function, *where).dtype == jnp.float32

@@ -145,8 +145,8 @@ from subterra_jax import lidar3d
 plan = st.load_tunnel("open:straight:val:4").slice(20.0, 60.0)
 relief = lidar3d.Relief.from_plan(plan)
 at = jnp.append(jnp.asarray(plan.centre[40]), plan.elevation[40] + 0.7)
-beams = jnp.tile(jnp.array([0.0, 1.0, 0.0]), (4096, 1))
-print(float(lidar3d.cast(relief, at, beams, plan.station[40], 30.0).sum()))
+at, beams = (jnp.tile(each, (4096, 1)) for each in (at, jnp.array([0.0, 1.0, 0.0])))
+print(float(lidar3d.meet(relief, at, beams, plan.station[40], 30.0).ranges.sum()))
 """
     environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}
     for code in (scan, march, scan + march, scan + march):
