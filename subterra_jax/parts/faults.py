@@ -22,6 +22,7 @@ from subterra_jax.state import EnvParams, State
 N_SEVERITIES = 5
 MAX_DELAY = 4  # steps
 PATCH = constants.WET_PATCH  # m of rail that are wet or dry as a whole
+_N_OWN = 5  # uniform numbers of a step beside those of the beams
 _WET = 17  # number of the draw that makes a patch wet
 SIZES = ("dropout_share", "dropout_steps", "dust_rate", "freeze_steps", "delay", "wet_share", "wet_loss")
 
@@ -89,27 +90,11 @@ def sensing(
     return jnp.concatenate([position, jnp.stack([heading, station, reading.distance, reading.heading])])
 
 
-def n_step_noise(n_beams: int) -> int:
-    """Count the uniform numbers of one step."""
-    return 5 + n_beams
-
-
-def draw_severity(draw: Float[Array, ""], params: FaultParams) -> Float[Array, ""]:
-    """Draw the severity of an episode; `draw` is uniform in [0, 1)."""
-    low, high = (jnp.asarray(bound).astype(draw.dtype) for bound in (params.severity_low, params.severity_high))
-    return jnp.minimum(low + jnp.floor(draw * (high - low + 1)), high)
-
-
 def grip(state: FaultState, station: Float[Array, ""], params: FaultParams) -> Float[Array, ""]:
     """Return true speed over wheel speed at a station: 1 on dry rail."""
     patch = jnp.floor(station / PATCH).astype(jnp.int32)
     wet = uniform(state.seed, patch, _WET) < params.wet_share * _share(state)
     return jnp.where(wet, 1.0 - params.wet_loss, 1.0)
-
-
-def frozen(state: FaultState) -> Bool[Array, ""]:
-    """Tell whether the odometer does not count at this step."""
-    return state.freeze_left > 0.0
 
 
 def advance_faults(
@@ -150,7 +135,7 @@ def corrupt(
     """Apply dust and drop-outs to true ranges; a lost beam reports exactly `range_max`."""
     n_beams = ranges.shape[0]
     rate = params.dust_rate * _share(state)
-    dust = draw[5 : 5 + n_beams]
+    dust = draw[_N_OWN : _N_OWN + n_beams]
     dusty = jnp.where(dust < rate, ranges * _again(dust, rate), ranges)
     return jnp.where(_dropped(state, n_beams), range_max, dusty)
 
@@ -199,7 +184,7 @@ class Faults(Part):
         )
 
     def uniforms(self, params: EnvParams) -> int:
-        return n_step_noise(params.lidar.n_beams)
+        return _N_OWN + params.lidar.n_beams
 
     def begin(self, draw: tuple[Array, ...], state: State, params: EnvParams) -> FaultState:
         """Begin an episode without faults; the robot has stood still until now."""
@@ -209,8 +194,9 @@ class Faults(Part):
         origin = jnp.stack([jnp.asarray(faults.origin_distance), jnp.asarray(faults.origin_heading)]) * draw[3][-1]
         now = sensing(state.position, state.heading, state.station, state.odometry)
         zero = jnp.zeros_like(draw[1])
+        low, high = (jnp.asarray(end).astype(zero.dtype) for end in (faults.severity_low, faults.severity_high))
         return FaultState(
-            severity=draw_severity(draw[1], faults),
+            severity=jnp.minimum(low + jnp.floor(draw[1] * (high - low + 1)), high),
             seed=draw[0][1],
             seen=jnp.broadcast_to(now, (MAX_DELAY + 1, 6)).at[1:, 4:].add(-past),
             dropout_left=zero,
@@ -231,7 +217,7 @@ class Faults(Part):
         """Take speed from the robot on wet rail, and none from its wheels; those of a frozen odometer seem to stand."""
         share = grip(own, state.station, self.sizes(own, params))
         motion = jnp.stack([drive.motion[0] * share, drive.motion[1]])
-        return Drive(jnp.where(frozen(own), 0.0, drive.wheels), motion)
+        return Drive(jnp.where(own.freeze_left > 0.0, 0.0, drive.wheels), motion)
 
     def advance(self, own: FaultState, step: Step, noise: Noise, params: EnvParams) -> FaultState:
         seen = sensing(step.position, step.heading, step.place.station, step.after["odometry"])

@@ -1,4 +1,4 @@
-"""Obstacles, a part of an environment: where the boxes of an episode stand, and what they do to robot and beams."""
+"""Obstacles, a part of an environment: where the boxes of an episode stand, ranges to them and distances from them."""
 
 import dataclasses
 from typing import Any, ClassVar
@@ -9,7 +9,6 @@ from flax import struct
 from jaxtyping import Array, Float, Int, UInt32
 
 from subterra_jax import constants
-from subterra_jax.parts.boxes import Boxes, distance_along, distance_to
 from subterra_jax.parts.hashing import uniform
 from subterra_jax.parts.part import Batch, Keys, Part, SensingState
 from subterra_jax.state import EnvParams, State
@@ -42,25 +41,60 @@ class ObstacleParams:
     trolley_width: float = constants.TROLLEY_WIDTH
 
 
-def boxes_near(
-    seed: UInt32[Array, ""], station: Float[Array, ""], reach: float, n: int, tunnel: Tunnel, params: ObstacleParams
-) -> Boxes:
-    """Return the boxes of `n` slots, from `reach` before a station on.
+@struct.dataclass
+class Boxes:
+    """A few boxes in the tunnel frame."""
 
-    Args:
-        seed: Seed of the episode; equal seeds give equal boxes.
-        station: Station of the observer, m.
-        reach: Distance back to the first slot, m.
-        n: Number of slots.
-        tunnel: The tunnel they stand in.
-        params: Their sizes; `first` is a station here, m.
-    """
-    slot = jnp.floor((station - reach) / PITCH).astype(jnp.int32) + jnp.arange(n, dtype=jnp.int32)
-    return boxes_in(seed, slot, tunnel, params)
+    centre: Float[Array, "n 2"]  # middles, m; far away where there is none
+    axis: Float[Array, "n 2"]  # unit vectors along the first side
+    half: Float[Array, "n 2"]  # half sides, m, the first along `axis`
+
+
+def distance_along(
+    boxes: Boxes, position: Float[Array, "2"], direction: Float[Array, "n_beams 2"]
+) -> Float[Array, "n_beams"]:
+    """Measure where each beam first meets a box, m; `inf` where it meets none, 0 from inside one."""
+    p_x, p_y = _in_frame(boxes, position[None] - boxes.centre)
+    axis_x, axis_y = boxes.axis[None, :, 0], boxes.axis[None, :, 1]
+    d_x, d_y = direction[:, 0, None], direction[:, 1, None]
+    ahead_x, ahead_y = d_x * axis_x + d_y * axis_y, d_y * axis_x - d_x * axis_y
+    near_x, far_x = _slab(p_x, ahead_x, boxes.half[:, 0])
+    near_y, far_y = _slab(p_y, ahead_y, boxes.half[:, 1])
+    near, far = jnp.maximum(near_x, near_y), jnp.minimum(far_x, far_y)
+    met = (near <= far) & (far >= 0.0)
+    return jnp.min(jnp.where(met, jnp.maximum(near, 0.0), jnp.inf), axis=-1)
+
+
+def distance_to(boxes: Boxes, position: Float[Array, "2"]) -> Float[Array, ""]:
+    """Measure the distance from a point to the nearest box, m; 0 inside."""
+    p_x, p_y = _in_frame(boxes, position[None] - boxes.centre)
+    out_x, out_y = (jnp.maximum(jnp.abs(p) - boxes.half[:, i], 0.0) for i, p in enumerate((p_x, p_y)))
+    apart = jnp.min(out_x * out_x + out_y * out_y)
+    # The root has no derivative at 0, inside a box.
+    outside = apart > 0.0
+    return jnp.where(outside, jnp.sqrt(jnp.where(outside, apart, 1.0)), 0.0)
+
+
+def _in_frame(boxes: Boxes, vector: Float[Array, "n 2"]) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
+    axis_x, axis_y = boxes.axis[:, 0], boxes.axis[:, 1]
+    return vector[:, 0] * axis_x + vector[:, 1] * axis_y, vector[:, 1] * axis_x - vector[:, 0] * axis_y
+
+
+def _slab(
+    origin: Float[Array, "n"], ahead: Float[Array, "n_beams n"], half: Float[Array, "n"]
+) -> tuple[Float[Array, "n_beams n"], Float[Array, "n_beams n"]]:
+    """Return where beams enter and leave the strip |x| ≤ half."""
+    tiny = jnp.where(ahead < 0.0, -1e-12, 1e-12)
+    inverse = 1.0 / jnp.where(jnp.abs(ahead) < 1e-12, tiny, ahead)
+    a, b = (-half - origin)[None] * inverse, (half - origin)[None] * inverse
+    return jnp.minimum(a, b), jnp.maximum(a, b)
 
 
 def boxes_in(seed: UInt32[Array, ""], slot: Int[Array, "n"], tunnel: Tunnel, params: ObstacleParams) -> Boxes:
-    """Return the boxes of given slots; slot k has the stations from 15 k to 15 (k + 1) m."""
+    """Return the boxes of given slots; slot k has the stations from 15 k to 15 (k + 1) m.
+
+    Equal seeds give equal boxes. `params.first` is a station here, m.
+    """
     u = lambda index: uniform(seed, slot, index)  # noqa: E731
     n_slots = jnp.maximum(jnp.floor(tunnel.length / PITCH), 2.0)
     trolley = slot == 1 + jnp.floor(uniform(seed, jnp.zeros((), jnp.int32), 9) * (n_slots - 1.0)).astype(jnp.int32)
@@ -82,17 +116,6 @@ def boxes_in(seed: UInt32[Array, ""], slot: Int[Array, "n"], tunnel: Tunnel, par
         axis=jnp.stack([tangent_x * cos - tangent_y * sin, tangent_x * sin + tangent_y * cos], axis=-1),
         half=half,
     )
-
-
-def clearance(
-    seed: UInt32[Array, ""],
-    station: Float[Array, ""],
-    position: Float[Array, "2"],
-    tunnel: Tunnel,
-    params: ObstacleParams,
-) -> Float[Array, ""]:
-    """Measure the distance from a point to the nearest box, m; 0 inside; exact up to 0.8 m."""
-    return distance_to(boxes_near(seed, station, 3.0, _N_NEAR, tunnel, params), position)
 
 
 @struct.dataclass
@@ -123,19 +146,22 @@ class Obstacles(Part):
     def clearance(
         self, own: ObstacleState, position: Array, station: Array, tunnel: Tunnel, params: EnvParams
     ) -> Array:
-        return clearance(own.seed, station, position, tunnel, _ahead(own, params))
+        return distance_to(_boxes_near(own, station, 3.0, _N_NEAR, tunnel, params), position)
 
     def hits(
         self, own: ObstacleState, sensing: SensingState, directions: Float[Array, "n_beams 2"], params: EnvParams
     ) -> Float[Array, "n_beams"]:
-        boxes = boxes_near(own.seed, sensing.station, REACH, N_SLOTS, sensing.tunnel, _ahead(own, params))
+        boxes = _boxes_near(own, sensing.station, REACH, N_SLOTS, sensing.tunnel, params)
         return distance_along(boxes, sensing.position, directions)
 
     def boxes(self, own: ObstacleState, station: Array, tunnel: Tunnel, params: EnvParams) -> list[Boxes]:
-        return [boxes_near(own.seed, station, REACH, N_SLOTS, tunnel, _ahead(own, params))]
+        return [_boxes_near(own, station, REACH, N_SLOTS, tunnel, params)]
 
 
-def _ahead(own: ObstacleState, params: EnvParams) -> ObstacleParams:
-    """Params of an episode's boxes, whose first station is counted from the mouth."""
-    sizes: ObstacleParams = params.obstacles
-    return sizes.replace(first=sizes.first + own.start)  # type: ignore[attr-defined]
+def _boxes_near(
+    own: ObstacleState, station: Float[Array, ""], reach: float, n: int, tunnel: Tunnel, params: EnvParams
+) -> Boxes:
+    """Return the boxes of `n` slots, from `reach` before a station on, m; none before `first` from the start."""
+    slot = jnp.floor((station - reach) / PITCH).astype(jnp.int32) + jnp.arange(n, dtype=jnp.int32)
+    sizes: Any = params.obstacles
+    return boxes_in(own.seed, slot, tunnel, sizes.replace(first=sizes.first + own.start))

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 from subterra_jax import constants
 from subterra_jax.parts.part import Batch, Bounds, Keys, Noise, Part, SensingState, Step
 from subterra_jax.parts.unicycle import wrap
-from subterra_jax.parts.wander import WanderParams, advance_wander, start_wander
+from subterra_jax.parts.wander import WanderParams, advance_wander
 from subterra_jax.state import EnvParams, State
 
 
@@ -63,24 +63,6 @@ class OdometryState:
     backward_bias: Float[Array, ""] | None = None
 
 
-def start_odometry(noise: Float[Array, "n"], params: OdometryParams) -> OdometryState:
-    """Set the odometer to 0 and draw its errors.
-
-    Args:
-        noise: Standard normal numbers: bias of distance, bias of heading, then the other errors if any.
-        params: Sizes of the errors.
-    """
-    zero = jnp.zeros_like(noise[0])
-    return OdometryState(
-        distance=zero,
-        heading=zero,
-        distance_bias=params.distance_bias_sigma * noise[0],
-        heading_bias=params.heading_bias_sigma * noise[1],
-        wander=None if params.wander is None else start_wander(noise[2], params.wander),
-        backward_bias=None if params.backward_bias_sigma is None else params.backward_bias_sigma * noise[-1],
-    )
-
-
 def advance_odometry(
     state: OdometryState,
     motion: Float[Array, "2"],
@@ -129,7 +111,16 @@ class Odometer(Part):
         return params.odometry.n_step_noise
 
     def begin(self, draw: Float[Array, "n"], state: State, params: EnvParams) -> OdometryState:
-        return start_odometry(draw, params.odometry)
+        """Set the odometer to 0; `draw` makes the biases of distance and heading, then the other errors if any."""
+        sizes, zero = params.odometry, jnp.zeros_like(draw[0])
+        return OdometryState(
+            distance=zero,
+            heading=zero,
+            distance_bias=sizes.distance_bias_sigma * draw[0],
+            heading_bias=sizes.heading_bias_sigma * draw[1],
+            wander=None if sizes.wander is None else sizes.wander.sigma * draw[2],
+            backward_bias=None if sizes.backward_bias_sigma is None else sizes.backward_bias_sigma * draw[-1],
+        )
 
     def advance(self, own: OdometryState, step: Step, noise: Noise, params: EnvParams) -> OdometryState:
         facing, along = step.before.heading, step.place.tangent

@@ -18,7 +18,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 if TYPE_CHECKING:
-    from subterra_jax.parts.boxes import Boxes
+    from subterra_jax.parts.obstacles import Boxes
     from subterra_jax.state import EnvParams, State
     from subterra_jax.tunnel import Foot, Tunnel
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from subterra_jax import constants
 from subterra_jax.parts.part import Batch, Drive, Keys, Noise, Part, Step
-from subterra_jax.parts.wander import WanderParams, advance_wander, start_wander
+from subterra_jax.parts.wander import WanderParams, advance_wander
 from subterra_jax.state import EnvParams, State
 
 
@@ -38,27 +38,11 @@ class SlipState:
     wander: Float[Array, ""]  # relative error of the speed at present, on top of `gain`, 1
 
 
-def start_slip(noise: Float[Array, "3"], params: SlipParams) -> SlipState:
-    """Draw the slip of an episode; `noise` is standard normal."""
-    return SlipState(
-        gain=params.gain_sigma * noise[0],
-        yaw=params.yaw_sigma * noise[1],
-        wander=start_wander(noise[2], params.wander),
-    )
-
-
 def true_motion(command: Float[Array, "2"], state: SlipState) -> Float[Array, "2"]:
     """Return the true speed (m/s), not below 0, and yaw rate (rad/s); a standing robot does not turn."""
     speed = command[0] * jnp.maximum(1.0 + state.gain + state.wander, 0.0)
     moves = (command[0] != 0.0) | (command[1] != 0.0)
     return jnp.stack([speed, command[1] + jnp.where(moves, state.yaw, 0.0)])
-
-
-def advance_slip(
-    state: SlipState, travelled: Float[Array, ""], noise: Float[Array, "1"], params: SlipParams
-) -> SlipState:
-    """Return the slip after a distance (m); `noise` is standard normal."""
-    return dataclasses.replace(state, wander=advance_wander(state.wander, travelled, noise[0], params.wander))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,14 +62,16 @@ class Slip(Part):
         return 1
 
     def begin(self, draw: Float[Array, "3"], state: State, params: EnvParams) -> SlipState:
-        return start_slip(draw, params.slip)
+        slip = params.slip
+        return SlipState(slip.gain_sigma * draw[0], slip.yaw_sigma * draw[1], slip.wander.sigma * draw[2])
 
     def drive(self, own: SlipState, drive: Drive, state: State, params: EnvParams) -> Drive:
         wheels = true_motion(drive.wheels, own)
         return Drive(wheels, wheels)
 
     def advance(self, own: SlipState, step: Step, noise: Noise, params: EnvParams) -> SlipState:
-        return advance_slip(own, step.moved, noise.normal, params.slip)
+        wander = advance_wander(own.wander, step.moved, noise.normal[0], params.slip.wander)
+        return dataclasses.replace(own, wander=wander)
 
     def privileged(self, own: SlipState) -> dict[str, Array]:
         """Return the slip of the speed (1) and of the yaw rate (rad/s)."""

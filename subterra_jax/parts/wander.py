@@ -9,7 +9,7 @@ from subterra_jax import constants
 
 @struct.dataclass
 class WanderParams:
-    """A stationary Ornstein-Uhlenbeck process over distance.
+    """A stationary Ornstein-Uhlenbeck process over distance, which starts with a normal number of `sigma`.
 
     Attributes:
         sigma: Standard deviation at any place, in the unit of the error.
@@ -18,11 +18,6 @@ class WanderParams:
 
     sigma: float
     length: float = constants.WANDER_LENGTH
-
-
-def start_wander(noise: Float[Array, ""], params: WanderParams) -> Float[Array, ""]:
-    """Draw a value from the stationary distribution; `noise` is standard normal."""
-    return params.sigma * noise
 
 
 def advance_wander(

@@ -1,5 +1,7 @@
 """Boxes on the way: where they may stand, and rays and distances against known answers."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +10,7 @@ import pytest
 import subterra_jax as st
 from benchmarks import reference
 from subterra_jax.parts import hashing, obstacles
-from subterra_jax.parts.boxes import Boxes, distance_along
+from subterra_jax.parts.obstacles import Boxes, distance_along
 from subterra_jax.tunnel import Tunnel
 
 PARAMS = jax.tree.map(jnp.float32, obstacles.ObstacleParams())
@@ -50,11 +52,8 @@ def test_scans_among_boxes_agree_with_float64_on_walls_and_boxes_alike(tunnel):
     sides = np.asarray(segments(boxes), np.float64).reshape(-1, 4)
     everything = np.concatenate([walls, sides])
     free = reference.clearance(sides, poses.position) > 0.3
-    inside = np.asarray(
-        jax.jit(jax.vmap(obstacles.clearance, (None, 0, 0, None, None)))(
-            own.seed, poses.station, poses.position, params.tunnel, sizes
-        )
-    )
+    clearance = jax.jit(jax.vmap(obstacles.Obstacles().clearance, (None, 0, 0, None, None)))
+    inside = np.asarray(clearance(own, poses.position, poses.station, params.tunnel, params))
     keep = free & (inside > 0.0)
     assert keep.sum() > 40
     noise = env.draw_step(jax.random.key(0), (60,), params)
@@ -98,11 +97,12 @@ def test_the_clearance_is_the_distance_to_the_nearest_side(tunnel):
     boxes = jax.jit(obstacles.boxes_in)(jnp.uint32(5), slots, tunnel, PARAMS)
     sides = np.asarray(segments(boxes), np.float64).reshape(-1, 4)
     plan, compared = st.load_tunnel("subterra-351"), 0
-    clearance = jax.jit(obstacles.clearance)
+    own, params = obstacles.ObstacleState(jnp.uint32(5), 0.0), SimpleNamespace(obstacles=PARAMS)
+    clearance = jax.jit(lambda at, station: obstacles.Obstacles().clearance(own, at, station, tunnel, params))
     for node in range(40, 1000, 9):
         position = plan.centre[node].astype(np.float32)
         expected = reference.clearance(sides, position[None])[0]
-        found = float(clearance(jnp.uint32(5), jnp.float32(plan.station[node]), position, tunnel, PARAMS))
+        found = float(clearance(position, jnp.float32(plan.station[node])))
         if 0.0 < found < 0.8 or expected < 0.8:
             assert found in (pytest.approx(expected, abs=1e-4), 0.0)
             compared += 1
