@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Callable
-from functools import partial
 from typing import Any, TypeAlias
 
 import jax
@@ -199,11 +198,10 @@ def rollout(
     leaves, tree = jax.tree.flatten(policy)
     arrays = [leaf if isinstance(leaf, jax.Array | np.ndarray | int | float) else None for leaf in leaves]
     fixed = env, n_steps, tree, tuple(leaf for leaf, array in zip(leaves, arrays, strict=True) if array is None)
-    run = _roll if hashable(fixed) else _roll.__wrapped__
+    run = _roll_compiled if hashable(fixed) else _roll
     return run(fixed, arrays, key, obs, state, params, memory)
 
 
-@partial(jax.jit, static_argnums=0)
 def _roll(
     fixed: tuple[AutoReset, int, Any, tuple[Any, ...]],
     arrays: list[Any],
@@ -238,3 +236,6 @@ def _roll(
 
     (obs, state, memory), records = jax.lax.scan(one_step, (obs, state, memory), jax.random.split(key, n_steps))
     return obs, state, {**records, "memory": memory} if remembers else records
+
+
+_roll_compiled = jax.jit(_roll, static_argnums=0)

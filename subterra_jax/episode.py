@@ -100,10 +100,6 @@ class Driver:
 
         What is compiled here is not compiled again by `begin` and `go` of as many episodes and steps. 0 where the
         device does not tell.
-
-        Args:
-            n: Number of episodes.
-            n_steps: Steps of one call of `go`.
         """
         seed, whole = jax.ShapeDtypeStruct((n,), jnp.uint32), jax.ShapeDtypeStruct((n,), jnp.int32)
         begun = _begin.lower(self, agent, params, seed, whole, whole)

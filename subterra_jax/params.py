@@ -1,8 +1,14 @@
-"""Params of an environment: gathered from its motion, parts and rule, made arrays, and checked."""
+"""Params of an environment: gathered from its motion, parts and rule, made arrays, and checked; and their digest.
+
+Every number enters the digest under a key, its dotted path at the time when the key was made. Class names do not enter.
+Whoever renames a part or a field gives the old key in `RENAMED`: the tests list every key and its value.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import json
 from collections.abc import Mapping
 from typing import Any
 
@@ -111,3 +117,37 @@ def check_length(env: TunnelEnv, params: EnvParams) -> None:
     shortest, needed = float(np.min(np.asarray(params.tunnel.length))), env.rule.least_length(params)
     if shortest < needed:
         raise ValueError(f"{env.id} needs a tunnel of {needed:g} m, this one has {shortest:.1f} m")
+
+
+RENAMED: dict[str, str] = {}  # beginning of a path today: what its keys begin with
+
+
+def task_figures(env: TunnelEnv, params: EnvParams) -> dict[str, Any]:
+    """Return the numbers of a task by key, whatever its tunnel, and the keys of rule and parts."""
+    leaves = jax.tree_util.tree_flatten_with_path({"horizon": params.horizon, **params.parts})[0]
+    return {
+        "rule": env.rule.key,
+        "parts": [key_of(part.name) for part in (env.motion, *env.parts)],
+        "beams": params.lidar.n_beams,
+        "numbers": {
+            key_of(jax.tree_util.keystr(path, simple=True, separator=".")): plain(leaf) for path, leaf in leaves
+        },
+    }
+
+
+def key_of(path: str) -> str:
+    """Return the key of a dotted path."""
+    for begin, key in RENAMED.items():
+        if path == begin or path.startswith(f"{begin}."):
+            return key + path.removeprefix(begin)
+    return path
+
+
+def plain(leaf: Any) -> Any:
+    """Return a number or an array as plain values that JSON writes in one way."""
+    return np.round(np.asarray(leaf, np.float64), 9).tolist()
+
+
+def digest(content: Any) -> str:
+    """Return the SHA-256 of plain values."""
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

@@ -74,7 +74,6 @@ def randomize(
 
 
 def _find(params: EnvParams, name: str) -> Array:
-    """The number of a dotted name, or what is wrong with that name."""
     node: Any = params
     path = name.split(".")
     for depth, part in enumerate(path):
@@ -121,8 +120,6 @@ def _bounds(name: str, needed: Range, leaf: Array) -> tuple[int | float, int | f
 
 
 def _check(params: EnvParams, bounds: dict[str, tuple[int | float, int | float]]) -> None:
-    """Refuse ranges of which some combination would be simulated wrongly."""
-
     def extremes(name: str) -> tuple[int | float, int | float]:
         value = _find(params, name)
         return bounds.get(name, (float(np.min(value)), float(np.max(value))))

@@ -15,21 +15,29 @@ import numpy as np
 from subterra_jax import constants as c
 from subterra_jax.adapters import register_tasks
 from subterra_jax.compiled import keep_programs
-from subterra_jax.digest import digest, task_figures
 from subterra_jax.host.errors import SubterraError, TunnelError
 from subterra_jax.host.loading import load_module
 from subterra_jax.host.task_ids import BENCHMARK, MISSIONS, PLANAR, WALK, full_id, no_task
 from subterra_jax.host.texture import check_dial
 from subterra_jax.lidar import LidarParams
-from subterra_jax.params import check_length, check_robot, check_together, collect_entries, make_params
+from subterra_jax.params import (
+    check_length,
+    check_robot,
+    check_together,
+    collect_entries,
+    digest,
+    make_params,
+    task_figures,
+)
 from subterra_jax.parts import Faults, Imu, Obstacles, Odometer, Part, PlanarLidar, Slip
 from subterra_jax.parts.odometer import OdometryParams
+from subterra_jax.parts.slip import WanderParams
 from subterra_jax.parts.spatial_lidar import SENSORS, SpatialLidar, SpatialParams, make_sensor
-from subterra_jax.parts.wander import WanderParams
 from subterra_jax.procedural import expand, open_world
 from subterra_jax.rules import GoalParams, Relocalise, Rule, StartParams, StopAt, Traverse, TurnBack
 from subterra_jax.rules.rule import GOAL_KINDS
 from subterra_jax.state import EnvParams
+from subterra_jax.tunnel.plan import TunnelPlan
 from subterra_jax.tunnel.sources import Source, resolve
 from subterra_jax.tunnel_env import TunnelEnv
 
@@ -213,17 +221,17 @@ def make(
         tunnel = Path(overrides["scene"]) / "tunnel.npz"
     if id in TASKS:
         tunnel = tunnel_for(id, tunnel, split, spatial=not is_planar(sensor))
-    elif split is not None:
-        raise ValueError(f"{id} happens in one tunnel: name it in place of a split")
     if hidden_start:
         overrides = {"start": _hidden_start(id, overrides), **overrides}
     if id == WALK or id in MISSIONS:
         from subterra_jax.b2 import tasks as walking  # MuJoCo is loaded only where physics is meant
 
+        if split is not None or not isinstance(tunnel, str | Path | TunnelPlan | None):
+            raise ValueError(f"{id} happens in one tunnel: give its name, its file or its plan")
         if id == WALK:
             _require_planar(id, sensor, sweep)
-            return walking.make(id, tunnel, lining, **overrides)  # type: ignore[arg-type]
-        return walking.make_mission(id, tunnel, lining, sensor=sensor, sweep=sweep, **overrides)  # type: ignore[arg-type]
+            return walking.make(id, tunnel, lining, **overrides)
+        return walking.make_mission(id, tunnel, lining, sensor=sensor, sweep=sweep, **overrides)
     task = TASKS[id]
     spatial = not is_planar(sensor)
     check_dial(texture)

@@ -271,7 +271,6 @@ class TunnelEnv:
         return next((levels for part in self.parts if (levels := part.levels(params))), range(1))
 
     def at_level(self, params: EnvParams, level: Any) -> EnvParams:
-        """Return the params with one level of difficulty."""
         for part in self.parts:
             params = part.at_level(params, level)
         return params

@@ -10,8 +10,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from subterra_jax.baselines.agent import observed
-from subterra_jax.policies.layout import Layout
-from subterra_jax.policies.learnt import KIND, LOCALISER, NETWORK
+from subterra_jax.policies.learnt import KIND, LOCALISER, NETWORK, Layout
 from subterra_jax.policies.memories import Given
 from subterra_jax.policies.network import Network, Outputs, init, start_memory, to_action
 from subterra_jax.policies.trained import flat

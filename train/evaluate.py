@@ -51,8 +51,7 @@ def evaluate(world: World, agent: Trained, n_episodes: int) -> dict[str, Any]:
     check_episodes(n_episodes)
     released.check_fits(agent, world.env, world.params, agent.name)
     episodes = listed_episodes(world.env, world.params, n_episodes)
-    agent = released.with_map(agent, world.params)
-    return scores(drive(world.env, world.params, agent, episodes, _BATCH))
+    return scores(drive(world.env, world.params, agent.with_map(world.params), episodes, _BATCH))
 
 
 def scores(records: Records) -> dict[str, Any]:

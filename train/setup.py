@@ -10,7 +10,7 @@ from subterra_jax.baselines.agent import n_ranges, observed
 from subterra_jax.baselines.histogram import HistogramLocaliser
 from subterra_jax.episode import in_tunnel
 from subterra_jax.policies.inputs import N_WALLS, WAY_AT
-from subterra_jax.policies.layout import Layout
+from subterra_jax.policies.learnt import Layout
 from subterra_jax.policies.locate import memory
 from subterra_jax.policies.locate.map_strip import map_strip
 from subterra_jax.policies.memories import Given, Memory

@@ -55,7 +55,6 @@ class SubterraBraxEnv(Env):
 
     @property
     def params(self) -> EnvParams:
-        """The params."""
         return self.sys
 
     @property

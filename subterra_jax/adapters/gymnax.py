@@ -70,7 +70,6 @@ class SubterraGymnax:
 
     @partial(jax.jit, static_argnums=0)
     def reset(self, key: PRNGKeyArray, params: EnvParams | None = None) -> tuple[Float[Array, "n_obs"], State]:
-        """Begin an episode."""
         return self.env.reset(key, params or self.default_params)
 
     @partial(jax.jit, static_argnums=0)

@@ -43,7 +43,6 @@ class SubterraVecEnv(VecEnv):
         return obs
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Keep the actions for `step_wait`."""
         self._action = actions
 
     def step_wait(self) -> tuple[Observation, np.ndarray, np.ndarray, list[dict[str, Any]]]:
@@ -58,11 +57,9 @@ class SubterraVecEnv(VecEnv):
         return obs, np.array(reward), done, infos
 
     def close(self) -> None:
-        """Release the renderer, if there is one."""
         self._envs.close()
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """Return a picture of each environment."""
         return self._envs.render() or [None] * self.num_envs
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:

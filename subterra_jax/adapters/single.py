@@ -91,5 +91,4 @@ class SubterraEnv(Door, Env[Observation, np.ndarray]):
         return self.view.picture(self.task_env, self.task_params, self.state, self._last("render"))
 
     def close(self) -> None:
-        """Release the renderer, if there is one."""
         self.view.close()

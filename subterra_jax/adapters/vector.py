@@ -184,7 +184,6 @@ class SubterraVectorEnv(Door, VectorEnv[Observation, np.ndarray, np.ndarray]):
         return tuple(self.view.picture(self.task_env, self.task_params, *each) for each in zip(own, obs, strict=True))
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Release the renderer, if there is one."""
         self.view.close()
 
     def _empty(self) -> Rows:

@@ -12,7 +12,7 @@ from subterra_jax.baselines.reckoning import command_errors, odometer_errors, od
 from subterra_jax.baselines.scanmodel import TunnelPose, move_pose
 from subterra_jax.baselines.stations import fault_sizes
 from subterra_jax.baselines.wallmap import WallMap
-from subterra_jax.parts.wander import WanderParams, advance_wander
+from subterra_jax.parts.slip import WanderParams, advance_wander
 from subterra_jax.state import EnvParams
 
 _POWERS = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)  # exponents by which a likelihood may be flattened
@@ -131,13 +131,7 @@ def move(
     turned: Float[Array, ""],
     params: CloudParams,
 ) -> Cloud:
-    """Moves a cloud by one step.
-
-    Args:
-        walls: The map, for the curvature.
-        travelled: Dead-reckoned distance, m.
-        turned: Dead-reckoned turn, rad; NaN is unknown, and replaced by that of the axis.
-    """
+    """Moves a cloud by a dead-reckoned distance, m, and turn, rad; NaN is unknown, and replaced by that of the axis."""
     n = cloud.scale.shape[0]
     normal = jax.random.normal(key, (2, n))
     flips = jax.random.uniform(jax.random.fold_in(key, 1), (n,)) < params.slip_rate * jnp.abs(travelled)
@@ -159,10 +153,8 @@ def weigh_odometer(
 
     Args:
         cloud: The cloud, before it moves.
-        commanded: Commanded distance of the step, m.
-        read: Step of the odometer, m.
+        commanded: Commanded distance of the step, m; `read` is that of the odometer.
         turned: Step of its heading, rad; NaN where the odometer stands, which tells nothing.
-        params: Motion of the cloud, with an odometer.
 
     Returns:
         The cloud with the errors that it has learnt, and the log likelihood up to a constant.

@@ -44,9 +44,8 @@ def summarise(
 
     Args:
         mass: The belief, which sums to 1; the first row faces growing stations, a second one falling stations.
-        station: Stations of the cells, m.
+        station: Stations of the cells, of a length `cell`, m.
         reach: Half the length of a cluster, m.
-        cell: Length of a cell, m.
 
     Returns:
         Its mean station (m), the standard deviation of the whole belief about it (m), whatever the direction, and 1

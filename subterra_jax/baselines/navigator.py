@@ -48,12 +48,7 @@ def is_turning(mission: Mission) -> Bool[Array, ""]:
 
 
 def target_speed(mission: Mission, estimate: Station, obs: Observed, params: EnvParams) -> Float[Array, ""]:
-    """Returns the speed to drive at, m/s: the largest, and in the last period what just reaches the target.
-
-    Args:
-        mission: Progress in the task.
-        estimate: Estimate of the station.
-    """
+    """Returns the speed to drive at, m/s: the largest, and in the last period what just reaches the target."""
     speed_max = jnp.asarray(params.vehicle.speed_max)
     if params.goal_kind == "cover":
         return speed_max
@@ -153,7 +148,6 @@ class Navigator:
 
     @property
     def uses_lidar(self) -> bool:
-        """True where the steering, or a localiser with a map, reads the ranges."""
         return self.steering.uses_lidar or self.uses_map
 
     @property

@@ -107,7 +107,6 @@ class ParticleLocaliser(Localiser):
     def _advance(
         self, key: PRNGKeyArray, memory: FilterMemory, obs: Observed, driven: Driven, params: EnvParams, known: Known
     ) -> tuple[Cloud, Reckoning]:
-        """Moves the particles by dead reckoning and reweights them by odometer and scan."""
         walls, motion, cloud = self.walls.pick(params.tunnel), self.motion, memory.cloud
         period, range_max = jnp.asarray(params.vehicle.period), jnp.asarray(params.lidar.range_max)
         apart = motion.odometer is not None

@@ -77,11 +77,9 @@ def known_delay(before: Reckoning, params: EnvParams, known: Known) -> Reckoning
 
 
 def seems_still(read: Float[Array, ""], commanded: Float[Array, ""]) -> Bool[Array, ""]:
-    """Tell whether an odometer seems to have stopped counting; its noise may go on.
+    """Tell by the distances read and commanded in a step, m, whether an odometer seems to have stopped counting.
 
-    Args:
-        read: Distance added in a step, m.
-        commanded: Distance commanded in that step, m; below 3 cm noise of 1 cm would decide.
+    Its noise may go on; below 3 cm noise of 1 cm would decide.
     """
     return (commanded > _LEAST_COMMAND) & (jnp.abs(read) < _STILL_SHARE * commanded)
 

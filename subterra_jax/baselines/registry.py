@@ -11,13 +11,12 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from subterra_jax.baselines.agent import Action, Agent, Known, Observed
 from subterra_jax.baselines.ceiling import NAME as BAYES
 from subterra_jax.baselines.ceiling import ceiling
-from subterra_jax.baselines.fused import FusedCount
 from subterra_jax.baselines.histogram import NAME as HISTOGRAM
 from subterra_jax.baselines.histogram import histogram_filter
 from subterra_jax.baselines.navigator import Navigator
 from subterra_jax.baselines.particle import particle_filter
 from subterra_jax.baselines.scanmatch import scan_matching
-from subterra_jax.baselines.stations import OdometerCount, Truth
+from subterra_jax.baselines.stations import FusedCount, OdometerCount, Truth
 from subterra_jax.baselines.steering import CentreLine, steering_of
 from subterra_jax.compiled import in_32_bits
 from subterra_jax.host.errors import SubterraError

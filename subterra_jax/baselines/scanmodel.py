@@ -87,18 +87,10 @@ class Endpoints:
 def endpoints(
     walls: WallMap, pose: TunnelPose, ranges: Float[Array, "n_beams"], range_max: Float[Array, ""], model: ScanModel
 ) -> Endpoints:
-    """Computes the ends of a scan's beams for several poses, with the centreline as a circle to either side.
+    """Computes the ends of a scan's beams (m; `range_max` without an echo) for several poses.
 
-    Args:
-        walls: The map of one tunnel.
-        pose: The poses; every field `(*n,)`.
-        ranges: The scan, m; beam 0 straight ahead, the others counter-clockwise.
-        range_max: The range of a beam without an echo, m.
-        model: Assumed errors of the LiDAR.
-
-    Returns:
-        The ends. With the true shape of the centreline they would move by less than 1 cm where the curvature changes
-        by 1e-4 1/m².
+    The centreline is a circle to either side. With its true shape they would move by less than 1 cm where the curvature
+    changes by 1e-4 1/m².
     """
     bearing = bearings(ranges.shape[0])
     shape = (-1, *[1] * pose.station.ndim)

@@ -243,7 +243,6 @@ class Avoidance(Steering):
         return jnp.min(jnp.where(in_way, ahead, _SEEN))
 
     def _lane(self, memory: Surroundings, params: EnvParams) -> Float[Array, ""]:
-        """Chooses the lane: long free, near, near the middle."""
         lane, free = self.lanes(memory, params)
         away = jnp.abs(lane - memory.corridor.offset)
         cost = 2.0 * (self.look_ahead - free) + away + 0.3 * jnp.abs(lane) + 0.5 * jnp.abs(lane - memory.lane)

@@ -51,11 +51,7 @@ def within(tolerance: float, sigma: Float[np.ndarray, " n"]) -> float:
 def is_above(success: float, bound: float, n: int, n_bound: int = 0) -> bool:
     """Tell whether a share of `n` episodes is above a bound by four standard errors: a table has some hundred shares.
 
-    Args:
-        success: The share, 0 to 1.
-        bound: The bound, exact or itself a share.
-        n: Episodes of the share.
-        n_bound: Episodes of the bound; 0 for an exact one.
+    The bound is exact, or itself a share of `n_bound` episodes.
     """
     variance = max(bound * (1.0 - bound), 0.25 / n) * (1.0 / n + (1.0 / n_bound if n_bound else 0.0))
     return success - bound > 4.0 * math.sqrt(variance)
@@ -63,7 +59,7 @@ def is_above(success: float, bound: float, n: int, n_bound: int = 0) -> bool:
 
 def way_out_variance(distance: Float[np.ndarray, " n"], params: EnvParams) -> Float[np.ndarray, " n"]:
     """Compute the variance of the distance driven after commands and readings of the way out, m²."""
-    errors = _Errors(params, STRETCH)
+    errors = _Errors(params)
     found = [0.0, *(errors.drive(1.0) for _ in range(math.ceil(distance.max() / STRETCH)))]
     return np.interp(distance, STRETCH * np.arange(len(found)), found)
 
@@ -75,7 +71,7 @@ def way_back_variance(distance: Float[np.ndarray, " n"], params: EnvParams) -> F
     """
     found = []
     for goal in distance:
-        errors = _Errors(params, STRETCH, float(params.start.station_sigma) ** 2)
+        errors = _Errors(params, float(params.start.station_sigma) ** 2)
         n = max(1, round(goal / STRETCH))
         for _ in range(n):
             errors.drive(1.0)
@@ -86,43 +82,33 @@ def way_back_variance(distance: Float[np.ndarray, " n"], params: EnvParams) -> F
     return np.array(found)
 
 
-def _full_step(params: EnvParams) -> float:
-    """Return the length of a step at full speed, m."""
-    return float(np.max(params.vehicle.speed_max * params.vehicle.period))
-
-
 class _Errors:
-    """Covariance of a Kalman filter, which needs no data.
+    """Covariance of a Kalman filter, which needs no data, over stretches of `STRETCH`.
 
     The state is the station (m), the lasting and the wandering slip, the lasting and the wandering scale error of the
     odometer, and what is added to that while facing falling stations.
 
     Args:
-        stretch: Distance of one call of `drive`, m.
         start: Variance of the station of the start, m².
     """
 
-    def __init__(self, params: EnvParams, stretch: float, start: float = 0.0):
-        self._stretch = stretch
+    def __init__(self, params: EnvParams, start: float = 0.0):
         slip, odometry = params.slip, params.odometry
         lasting = (0.0, slip.gain_sigma, 0.0, odometry.distance_bias_sigma, 0.0, odometry.backward_bias_sigma or 0.0)
         wandering = (None, None, slip.wander, None, odometry.wander, None)
         self._stationary = np.array([0.0 if w is None else float(w.sigma) ** 2 for w in wandering])
-        self._keep = np.array([1.0 if w is None else math.exp(-stretch / float(w.length)) for w in wandering])
+        self._keep = np.array([1.0 if w is None else math.exp(-STRETCH / float(w.length)) for w in wandering])
         self.covariance = np.diag(np.square(np.asarray(lasting, float)) + self._stationary)
         self.covariance[0, 0] += start
+        full_step = float(np.max(params.vehicle.speed_max * params.vehicle.period))
         # The readings' noise of a stretch, over its length: a variance of the scale.
-        self._noise = max(float(params.odometry.distance_sigma) ** 2 / (_full_step(params) * stretch), 1e-15)
+        self._noise = max(float(params.odometry.distance_sigma) ** 2 / (full_step * STRETCH), 1e-15)
 
     def drive(self, direction: float) -> float:
-        """Drive a stretch, which the odometer measures: 1 for growing stations, -1 for falling ones.
-
-        Returns:
-            Variance of the station afterwards, m².
-        """
+        """Drive a stretch by growing (1) or falling stations (-1); return the variance of the station after it, m²."""
         self.learn(np.array([0.0, 1.0, 1.0, 1.0, 1.0, float(direction < 0.0)]), self._noise)
         moved = np.eye(6)
-        moved[0, 1:3] = direction * self._stretch
+        moved[0, 1:3] = direction * STRETCH
         covariance = moved @ self.covariance @ moved.T
         self.covariance = covariance * np.outer(self._keep, self._keep) + np.diag(
             (1.0 - self._keep**2) * self._stationary

@@ -82,8 +82,6 @@ def _prepare(env: TunnelEnv, params: EnvParams, agent: Agent | DrivingPolicy) ->
 # Two of one environment are equal, as two bound methods would not be, so that evaluations share a compiled program.
 @dataclasses.dataclass(frozen=True)
 class _Start:
-    """Starts the count of an episode."""
-
     env: TunnelEnv
 
     def __call__(self, state: State, here: EnvParams) -> Tally:
@@ -92,8 +90,6 @@ class _Start:
 
 @dataclasses.dataclass(frozen=True)
 class _Add:
-    """Counts the steps of an episode."""
-
     env: TunnelEnv
 
     def __call__(self, now: Episode, taken: Taken, here: EnvParams) -> tuple[Tally, Array]:

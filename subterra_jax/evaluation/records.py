@@ -255,12 +255,7 @@ def start_tally(env: TunnelEnv, state: State, here: EnvParams) -> Tally:
 
 
 def add_step(tally: Tally, taken: Taken, tolerance: Float[Array, ""]) -> Tally:
-    """Add one step.
-
-    Args:
-        tally: Sums so far.
-        tolerance: Error up to which an estimate counts as right, m.
-    """
+    """Add one step; an estimate within the tolerance, m, counts as right."""
     info, estimate = taken.info, taken.action[2:4]
     moved = taken.after.position - taken.before.position
     change = jnp.abs(taken.after.command - taken.before.command)
@@ -295,13 +290,11 @@ def add_estimate(
     step: Int[Array, ""],
     tolerance: Float[Array, ""],
 ) -> EstimateTally:
-    """Add one step.
+    """Add one step, whose number counts from 1.
 
     Args:
-        tally: Sums so far.
         error: Estimate less truth, m; NaN makes every sum NaN, which is what no estimate scores.
         log_sigma: Log of the claimed standard deviation in m.
-        step: Number of the step, from 1.
         tolerance: Error up to which the estimate counts as locked, m.
     """
     sigma = jnp.exp(log_sigma)
@@ -315,11 +308,7 @@ def add_estimate(
 
 
 def crps(error: Float[Array, ""], sigma: Float[Array, ""]) -> Float[Array, ""]:
-    """Compute the continuous ranked probability score of a normal distribution, m.
-
-    Args:
-        error: Its mean less the truth, m.
-        sigma: Its standard deviation, m.
+    """Compute the continuous ranked probability score of a normal distribution, m, off the truth by `error`, m.
 
     Source: Gneiting and Raftery 2007, Strictly Proper Scoring Rules, eq. 21.
     """

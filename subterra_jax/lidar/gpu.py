@@ -66,16 +66,7 @@ def scan(
 
 
 def clearance(tunnel: Tunnel, position: Float[Array, "n 2"], start: Int[Array, " n"]) -> Float[Array, " n"]:
-    """Distances from many points in one tunnel to its nearest wall or furniture.
-
-    Args:
-        tunnel: The tunnel, one for all.
-        position: The points, tunnel frame, m.
-        start: First block that each point visits.
-
-    Returns:
-        As `unicycle.clearance`.
-    """
+    """`unicycle.clearance` of many points in one tunnel, each with the first block that it visits."""
     n_rows = _rows()
     count, rows = _pad_rows(n_rows, start, *position.T)
     n = len(rows[0])
@@ -128,13 +119,7 @@ class _Visit(NamedTuple):
     best: Array  # distance of what it has met, m; its square for clearances, m²
 
     def onward(self, start: Array, enters: Array, ends: Array) -> _Visit:
-        """Return the next visit.
-
-        Args:
-            start: First block ahead.
-            enters: The thread enters its block.
-            ends: Nothing more is to be found this way.
-        """
+        """Return the next visit, from the first block ahead, and whether nothing more is to be found this way."""
         visits = self.state == _VISITS
         back = visits & ends & (self.way > 0.0)
         following = self.block + self.way.astype(jnp.int32)
@@ -220,7 +205,6 @@ def _scan_kernel(
 
 
 def _count(state, what: int):
-    """Return how many threads are in a state."""
     return jnp.sum((state == what).astype(jnp.int32))
 
 

@@ -15,13 +15,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from subterra_jax.host.errors import TunnelError
-from subterra_jax.lidar3d.boxes import Boxes, split_boxes
-from subterra_jax.lidar3d.surface import Axis, Triangles
+from subterra_jax.lidar3d.surface import Axis, Boxes, Triangles, split_boxes
 
 # A ray may step this far over the face of a cell or prism without leaving what the cell lists, m.
 MARGIN = 1e-3
-# Wedges around the axis, a multiple of 4, and half-planes of a block's prism.
-N_WEDGES, N_FACES = 96, 16
+# Cells of a block along the axis, wedges around it, a multiple of 4, and half-planes of its prism.
+N_X, N_WEDGES, N_FACES = 12, 96, 16
 FACES = np.array([(np.cos(a), np.sin(a)) for a in 2.0 * np.pi / N_FACES * np.arange(N_FACES)])
 # Bits of a vertex's number in its block, of the two steps to the triangle's other vertices, and of a coordinate along
 # and across the axis.
@@ -88,7 +87,7 @@ class Cells:
     # distance of the faces of each block's empty prism from its axis, m, `(b, N_FACES)`
     prism: Float[np.ndarray, "b n_faces"]
     # first entry of each cell; number of entries in the upper half of a word, and in the lower the least distance from
-    # the axis in units of `NEAR_UNIT`, measured as `wedge_depth`; cells of a block by station and then wedge, `(b * n_x
+    # the axis in units of `NEAR_UNIT`, measured as `wedge_depth`; cells of a block by station and then wedge, `(b * N_X
     # * N_WEDGES, 2)`
     cell: Int[np.ndarray, "c 2"]
     # triangles of each cell: number of the first vertex in its block, and steps to the other two, `(e,)`
@@ -107,12 +106,11 @@ class _TooDense(Exception):
     """A block has more triangles than its integers can number."""
 
 
-def sort_triangles(axis: Axis, surface: Triangles, block_length: float, n_x: int) -> Cells:
+def sort_triangles(axis: Axis, surface: Triangles, block_length: float) -> Cells:
     """Sort the triangles of a surface into cells around an axis.
 
     Args:
         block_length: Target length of a block, m; halved until every block can number its triangles.
-        n_x: Cells of a block along the axis.
 
     Raises:
         ValueError: No triangle lies along the axis.
@@ -121,7 +119,7 @@ def sort_triangles(axis: Axis, surface: Triangles, block_length: float, n_x: int
     surface, boxes = split_boxes(surface)
     while True:
         try:
-            return _sort(axis, surface, boxes, block_length, n_x)
+            return _sort(axis, surface, boxes, block_length)
         except _TooDense as error:
             block_length *= 0.5
             if block_length < _SHORTEST:
@@ -131,20 +129,20 @@ def sort_triangles(axis: Axis, surface: Triangles, block_length: float, n_x: int
                 ) from error
 
 
-def _sort(axis: Axis, surface: Triangles, boxes: Boxes, block_length: float, n_x: int) -> Cells:
+def _sort(axis: Axis, surface: Triangles, boxes: Boxes, block_length: float) -> Cells:
     blocks = cut_blocks(axis, block_length)
     chosen = _parts_of_blocks(axis, surface.vertices[surface.faces], blocks)
     chosen_boxes = _parts_of_blocks(axis, boxes.corners(), blocks)
     if not any(len(parts) for parts in (*chosen, *chosen_boxes)):
         raise ValueError("no triangle lies along the axis")
     half = float(np.max(blocks.ends[:, 1] - blocks.ends[:, 0])) / 2
-    size = 2.0 * half / n_x
+    size = 2.0 * half / N_X
     local = [_compact(surface, faces, blocks, k) for k, faces in enumerate(chosen)]
     extent = np.abs(np.concatenate([np.ones((1, 3)), *(points for points, _ in local)])).max(axis=0)
     unit = np.array([extent[0], extent[1:].max()]) * (1.0 + 1e-6) / [(1 << X_BITS - 1) - 1, (1 << YZ_BITS - 1) - 1]
     parts, n_entries = [], 0
     for points, faces in local:
-        parts.append(_pack_block(points, faces, unit, -half, size, n_x, n_entries))
+        parts.append(_pack_block(points, faces, unit, -half, size, n_entries))
         n_entries += len(parts[-1][1])
     low = np.full(len(local), -half)
     cell, entry, vertex = zip(*parts, strict=True)
@@ -164,7 +162,6 @@ def _pack_block(
     unit: Float[np.ndarray, 2],
     low: float,
     size: float,
-    n_x: int,
     n_before: int,
 ) -> tuple[Int[np.ndarray, "c 2"], Int[np.ndarray, e], Int[np.ndarray, "w 2"]]:
     """Return cells, entries and vertices of one block, as `Cells` has them.
@@ -175,7 +172,6 @@ def _pack_block(
         unit: Units of the coordinates along and across the axis, m.
         low: Coordinate along the axis at which the first cell begins, m.
         size: Length of a cell along the axis, m.
-        n_x: Cells along the axis.
         n_before: Entries of the blocks before.
 
     Raises:
@@ -184,10 +180,10 @@ def _pack_block(
     vertex, numbered = _number_vertices(_pack_points(points, unit), faces)
     if len(vertex) > MOST_VERTICES:
         raise _TooDense
-    which, count, near, order = _list(points[faces], low, size, n_x)
+    which, count, near, order = _list(points[faces], low, size)
     if len(count) and count.max() > MOST_LISTED:
         raise _TooDense
-    cell = np.zeros((n_x * N_WEDGES, 2), np.int64)
+    cell = np.zeros((N_X * N_WEDGES, 2), np.int64)
     cell[:, 0] = n_before
     cell[which, 0] = n_before + np.cumsum(count) - count
     cell[which, 1] = (count << 16) | np.clip(near / NEAR_UNIT, 0, (1 << 16) - 1).astype(np.int64)
@@ -276,7 +272,7 @@ def wedge_place(y: Float[np.ndarray, "*k"], z: Float[np.ndarray, "*k"]) -> Float
 
 
 def _list(
-    corner: Float[np.ndarray, "t 3 3"], low: float, size: float, n_x: int
+    corner: Float[np.ndarray, "t 3 3"], low: float, size: float
 ) -> tuple[Int[np.ndarray, c], Int[np.ndarray, c], Float[np.ndarray, c], Int[np.ndarray, p]]:
     """List the triangles of every cell of a block.
 
@@ -290,7 +286,7 @@ def _list(
     least, most = np.where(inside, x, np.inf).min(axis=0), np.where(inside, x, -np.inf).max(axis=0)
     near = np.where(inside, depth, np.inf).min(axis=0)[there] - MARGIN
     start, stop = (
-        np.clip(np.floor((value[there] - low) / size), 0, n_x - 1).astype(np.int64)
+        np.clip(np.floor((value[there] - low) / size), 0, N_X - 1).astype(np.int64)
         for value in (least - MARGIN, most + MARGIN)
     )
     span = stop - start + 1

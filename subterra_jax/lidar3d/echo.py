@@ -51,12 +51,7 @@ class EchoParams:
 def add_noise(
     ranges: Float[Array, "n"], cosine: Float[Array, "n"], normal: Float[Array, "n"], params: EchoParams
 ) -> Float[Array, "n"]:
-    """Return ranges with noise, m.
-
-    Args:
-        ranges: True ranges, m.
-        cosine: Cosine of incidence, 0 to 1.
-    """
+    """Return ranges with noise, m, of true ranges and cosines of incidence, 0 to 1."""
     slant = jnp.clip(cosine, 1e-3, 1.0)
     tangent = jnp.minimum(jnp.sqrt(1.0 - slant * slant) / slant, STEEPEST)
     variance = params.sigma**2 + (params.sigma_per_metre * ranges) ** 2 + (params.sigma_slant * tangent) ** 2
@@ -76,13 +71,7 @@ def returns(
     uniform: Float[Array, "n"],
     params: EchoParams,
 ) -> Bool[Array, "n"]:
-    """Draw which pulses come back: echoes above the weakest one, faded by a log-normal factor, less those lost.
-
-    Args:
-        ranges: True ranges, m.
-        cosine: Cosine of incidence, 0 to 1.
-        reflectivity: Reflectivity of what is met.
-    """
+    """Draw which pulses come back: echoes above the weakest one, faded by a log-normal factor, less those lost."""
     echo = reflectivity * jnp.maximum(cosine, 1e-6) / jnp.maximum(ranges * ranges, 1e-6)
     weakest = jnp.maximum(params.weakest, 1e-12)
     share = jax.scipy.special.ndtr(jnp.log(echo / weakest) / FADING)

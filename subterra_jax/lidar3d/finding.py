@@ -52,7 +52,7 @@ def by_xla(
     def some(rows: Any) -> tuple[Hits, Point]:
         origin, direction, block, limit = rows
         origin, direction = tuple(origin.T), tuple(direction.T)
-        hits = march(tools, relief.n_x, origin, direction, block, limit)
+        hits = march(tools, origin, direction, block, limit)
         return hits, normals(tools, origin, direction, hits)
 
     def cut(row: Array) -> Array:
@@ -66,7 +66,7 @@ def by_xla(
 def by_numba(relief: Relief, *rows: Any) -> tuple[Hits, Point]:
     """Find the first triangles by machine code, and their normals by XLA; arguments as for `by_xla`."""
     arrays = tuple(getattr(relief, name) for name in ARRAYS)
-    hits = Hits(*compiled_by_numba("march")(arrays, relief.n_x, *rows))
+    hits = Hits(*compiled_by_numba("march")(arrays, *rows))
     return hits, normals(tools_of(relief), tuple(rows[0].T), tuple(rows[1].T), hits)
 
 

@@ -48,7 +48,7 @@ def find(
         place, image = row, None
     kinds = (jnp.float32, jnp.int32, jnp.int32, *(jnp.float32,) * 3)
     out = pl.pallas_call(
-        partial(_kernel, n_x=relief.n_x, image=image),
+        partial(_kernel, image=image),
         grid=(ways[0].shape[0] // ROWS,),
         in_specs=[row] * 3 + [place] * 5 + [whole] * len(ARRAYS),
         out_specs=[row] * len(kinds),
@@ -60,7 +60,7 @@ def find(
     return Hits(*parts[:3]), parts[3:]
 
 
-def _kernel(*refs: Any, n_x: int, image: tuple[int, int] | None) -> None:
+def _kernel(*refs: Any, image: tuple[int, int] | None) -> None:
     """March 32 rays, those of an image column by column."""
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
@@ -78,7 +78,7 @@ def _kernel(*refs: Any, n_x: int, image: tuple[int, int] | None) -> None:
     dx, dy, dz = (ref[...] if mine is None else triton.load(ref.at[mine]) for ref in refs[:3])
     ox, oy, oz, block, limit = (jnp.broadcast_to(ref[...], (ROWS,)) for ref in refs[3:8])
     origin, direction = (ox, oy, oz), (dx, dy, dz)
-    hits = march(tools, n_x, origin, direction, block, limit)
+    hits = march(tools, origin, direction, block, limit)
     parts = (*hits, *normals(tools, origin, direction, hits))
     for ref, part in zip(refs[8 + len(ARRAYS) :], parts, strict=True):
         if mine is None:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from subterra_jax.lidar3d.cells import FACES, MARGIN, N_WEDGES, NEAR_UNIT, X_BITS
+from subterra_jax.lidar3d.cells import FACES, MARGIN, N_WEDGES, N_X, NEAR_UNIT, X_BITS
 from subterra_jax.lidar3d.meeting import FINE, Hits, Point, Ray, Tools, meet_boxes, meet_one
 from subterra_jax.lidar3d.relief import N_FRAME, N_LINK
 
@@ -27,22 +27,11 @@ class Rays(NamedTuple):
     going: Bool[Array, "n"]  # the ray may still meet a nearer one
 
 
-def march(
-    tools: Tools, n_x: int, origin: Point, direction: Point, block: Int[Array, "n"], limit: Float[Array, "n"]
-) -> Hits:
-    """Find the first triangle that each ray meets within its limit.
-
-    Args:
-        tools: Operations of the kernel.
-        n_x: Cells of a block along the axis.
-        origin: Origins, tunnel frame, m, each `(n,)`.
-        direction: Unit vectors, tunnel frame, each `(n,)`.
-        block: Blocks around the origins.
-        limit: Largest distances of interest, m.
-    """
+def march(tools: Tools, origin: Point, direction: Point, block: Int[Array, "n"], limit: Float[Array, "n"]) -> Hits:
+    """Find the first triangle that each ray meets within its limit, m, from an origin (tunnel frame, m) in a block."""
 
     def one_block(rays: Rays) -> Rays:
-        return _cross_block(tools, n_x, origin, direction, limit, rays)
+        return _cross_block(tools, origin, direction, limit, rays)
 
     none = Hits(jnp.full_like(limit, jnp.inf), jnp.full_like(block, -1), block)
     start = Rays(block, jnp.zeros_like(limit), none, limit >= 0.0)
@@ -53,10 +42,10 @@ def _any(mask: Bool[Array, "n"]) -> Bool[Array, ""]:
     return jnp.max(mask.astype(jnp.int32)) > 0
 
 
-def _cross_block(tools: Tools, n_x: int, origin: Point, direction: Point, limit: Array, rays: Rays) -> Rays:
+def _cross_block(tools: Tools, origin: Point, direction: Point, limit: Array, rays: Rays) -> Rays:
     """Take each ray that goes on through its block."""
     way = _enter_block(tools, origin, direction, limit, rays)
-    found, entry = _cross_cells(tools, n_x, way, rays.going & (way.end >= 0.0))
+    found, entry = _cross_cells(tools, way, rays.going & (way.end >= 0.0))
     hits = _nearer(way.hits, Hits(way.begin + found, entry, rays.block))
     going = rays.going & (way.leave < jnp.minimum(limit, hits.distance)) & (way.following >= 0)
     following, reached = jnp.where(going, way.following, rays.block), jnp.where(going, way.leave, rays.reached)
@@ -109,7 +98,6 @@ def _enter_block(tools: Tools, origin: Point, direction: Point, limit: Array, ra
 
 
 def _nearer(one: Hits, other: Hits) -> Hits:
-    """Return the nearer of two hits of each ray."""
     nearer = other.distance < one.distance
     return Hits(*(jnp.where(nearer, b, a) for a, b in zip(one, other, strict=True)))
 
@@ -176,12 +164,12 @@ def _ray_in_cells(tools: Tools, way: Way) -> Ray:
     return Ray(units, speeds, (at[0] - way.low) * way.per_cell, slope, forward, onward)
 
 
-def _cross_cell(tools: Tools, n_x: int, way: Way, ray: Ray, step: Step) -> Step:
+def _cross_cell(tools: Tools, way: Way, ray: Ray, step: Step) -> Step:
     """Compare rays with the triangles of their cells, if they come near these, and take them to the next cells."""
     at, d = way.at, way.d
     edge = step.x + ray.forward
     # The outermost cells reach to infinity.
-    leave_x = jnp.where((edge <= 0) | (edge >= n_x), jnp.inf, (edge.astype(jnp.float32) - ray.x) * ray.slope)
+    leave_x = jnp.where((edge <= 0) | (edge >= N_X), jnp.inf, (edge.astype(jnp.float32) - ray.x) * ray.slope)
     turn = step.wedge.astype(jnp.float32) * (4.0 / N_WEDGES)
     (y0, z0), (y1, z1) = wedge_edge(turn), wedge_edge(turn + 4.0 / N_WEDGES)
     y, z = jnp.where(ray.onward, y1, y0), jnp.where(ray.onward, z1, z0)
@@ -209,14 +197,12 @@ def _cross_cell(tools: Tools, n_x: int, way: Way, ray: Ray, step: Step) -> Step:
     return Step(x, wedge, jnp.where(going, leave, step.reached), hit, entry, going)
 
 
-def _cross_cells(
-    tools: Tools, n_x: int, way: Way, going: Bool[Array, "n"]
-) -> tuple[Float[Array, "n"], Int[Array, "n"]]:
+def _cross_cells(tools: Tools, way: Way, going: Bool[Array, "n"]) -> tuple[Float[Array, "n"], Int[Array, "n"]]:
     """Return the distance at which rays meet a triangle in their block, m, or `inf`, and its entry."""
     ray = _ray_in_cells(tools, way)
-    first_x, nothing = jnp.clip(ray.x, 0.0, n_x - 1.0).astype(jnp.int32), jnp.full_like(way.end, jnp.inf)
+    first_x, nothing = jnp.clip(ray.x, 0.0, N_X - 1.0).astype(jnp.int32), jnp.full_like(way.end, jnp.inf)
     wedge = wedge_at(tools, way.at[1], way.at[2])
     start = Step(first_x, wedge, jnp.zeros_like(way.end), nothing, jnp.full_like(first_x, -1), going)
-    one_cell = partial(_cross_cell, tools, n_x, way, ray)
+    one_cell = partial(_cross_cell, tools, way, ray)
     step = lax.while_loop(lambda step: _any(step.going), one_cell, start)
     return step.hit, step.entry

@@ -43,7 +43,6 @@ class Tools(NamedTuple):
         return self.fma(a, b, -(c * d))
 
     def cross(self, a: Any, b: Any) -> Point:
-        """Return the vector product."""
         minor = self.minor
         return minor(a[1], b[2], a[2], b[1]), minor(a[2], b[0], a[0], b[2]), minor(a[0], b[1], a[1], b[0])
 

@@ -9,7 +9,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from subterra_jax.lidar3d.cells import N_FACES, N_WEDGES, STEP_BITS, X_BITS, Cells, sort_triangles
+from subterra_jax.lidar3d.cells import N_FACES, N_WEDGES, N_X, STEP_BITS, X_BITS, Cells, sort_triangles
 from subterra_jax.lidar3d.rolled import raise_shell
 from subterra_jax.lidar3d.surface import Axis, Triangles
 from subterra_jax.lidar3d.upright import raise_walls
@@ -41,7 +41,6 @@ class Relief:
         entry: As in `Cells`.
         vertex: As in `Cells`.
         box: As in `Cells`.
-        n_x: Cells of a block along the axis.
     """
 
     length: Float[Array, "*k"]
@@ -53,7 +52,6 @@ class Relief:
     entry: Int[Array, "n_entries"]
     vertex: Int[Array, "n_vertices 2"]
     box: Float[Array, "n_boxes 12"]
-    n_x: int = struct.field(pytree_node=False)
 
     @classmethod
     def from_plan(cls, plan: TunnelPlan, lining: str | None = None) -> "Relief":
@@ -74,18 +72,17 @@ class Relief:
         return cls.from_triangles(*raise_walls(plan, lining))
 
     @classmethod
-    def from_triangles(cls, axis: Axis, surface: Triangles, n_x: int = 12) -> "Relief":
+    def from_triangles(cls, axis: Axis, surface: Triangles) -> "Relief":
         """Put a surface around an axis on the device.
 
         Args:
             axis: The axis; beyond its ends, the mouths, a ray hits nothing.
-            n_x: Cells of a block along the axis; affects speed and memory alone.
 
         Raises:
             ValueError: No triangle lies along the axis.
             TunnelError: A quarter of a metre of the bore has too many triangles.
         """
-        cells = sort_triangles(axis, surface, BLOCK_LENGTH, n_x)
+        cells = sort_triangles(axis, surface, BLOCK_LENGTH)
         n_blocks = len(cells.low)
         return cls(
             length=_put(axis.station[-1], np.float32),
@@ -97,7 +94,6 @@ class Relief:
             entry=_put(cells.entry, np.int32),
             vertex=_put(cells.vertex, np.int32),
             box=_put(cells.box if len(cells.box) else np.zeros((1, 12)), np.float32),
-            n_x=n_x,
         )
 
     @property
@@ -128,23 +124,19 @@ def stack_reliefs(reliefs: Sequence[Relief]) -> Relief:
     """Join several bores into one `Relief`, whose `pick(i)` gives the i-th.
 
     Args:
-        reliefs: One or more single bores, made with one `n_x`.
+        reliefs: One or more single bores.
 
     Returns:
         The stack; a single bore is returned unchanged.
 
     Raises:
-        ValueError: The list is empty, one of them is a stack itself, or their blocks have different numbers of cells.
+        ValueError: The list is empty, or one of them is a stack itself.
     """
     if not reliefs:
         raise ValueError("a stack needs at least one relief, got none")
     for i, relief in enumerate(reliefs):
         if relief.count > 1:
             raise ValueError(f"relief {i} is a stack of {relief.count} reliefs itself")
-        if relief.n_x != reliefs[0].n_x:
-            raise ValueError(
-                f"relief {i} has {relief.n_x} cells along a block, the first {reliefs[0].n_x}: make both with one n_x"
-            )
     if len(reliefs) == 1:
         return reliefs[0]
     parts = {name: [np.asarray(getattr(r, name)) for r in reliefs] for name in ARRAYS}
@@ -159,7 +151,6 @@ def stack_reliefs(reliefs: Sequence[Relief]) -> Relief:
         length=_put(np.stack([np.asarray(r.length) for r in reliefs]), np.float32),
         first_block=_put(first["frame"], np.int32),
         n_blocks=_put(np.stack([np.asarray(r.n_blocks) for r in reliefs]), np.int32),
-        n_x=reliefs[0].n_x,
         **{name: _put(np.concatenate(arrays), arrays[0].dtype) for name, arrays in parts.items()},
     )
 
@@ -167,7 +158,7 @@ def stack_reliefs(reliefs: Sequence[Relief]) -> Relief:
 def block_contents(relief: Relief, block: int) -> tuple[Float[np.ndarray, "t 3 3"], Float[np.ndarray, "k 3 4"]]:
     """Return the corners of a block's triangles in its frame, m, and its boxes as in `Cells.box`; on the host."""
     *_, first_vertex, first_cell, first_box, n_boxes = np.asarray(relief.link[block]).tolist()
-    cell = np.asarray(relief.cell[first_cell : first_cell + relief.n_x * N_WEDGES]).view(np.uint32)
+    cell = np.asarray(relief.cell[first_cell : first_cell + N_X * N_WEDGES]).view(np.uint32)
     first_entry, n_entries = int(cell[0, 0]), int((cell[:, 1] >> 16).sum())
     code = np.unique(np.asarray(relief.entry[first_entry : first_entry + n_entries]).view(np.uint32)).astype(np.int64)
     first, most = code >> 2 * STEP_BITS, (1 << STEP_BITS) - 1

@@ -96,7 +96,6 @@ def clearance(tunnel: Tunnel, position: Float[Array, "n 2"], start: Int[Array, "
 
 def march(
     arrays: tuple[Array, ...],
-    n_x: int,
     origin: Float[Array, "n 3"],
     direction: Float[Array, "n 3"],
     block: Int[Array, " n"],
@@ -106,6 +105,4 @@ def march(
     from subterra_jax.native.marching import march_rows  # planar tasks do not need it
 
     shapes = [jax.ShapeDtypeStruct(block.shape, kind) for kind in (jnp.float32, jnp.int32, jnp.int32)]
-    # The first axis of the first argument counts rays.
-    size = np.full(1, n_x, np.int32)
-    return tuple(_call("subterra_march", march_rows, 128, shapes, origin, direction, block, limit, *arrays, size))
+    return tuple(_call("subterra_march", march_rows, 128, shapes, origin, direction, block, limit, *arrays))

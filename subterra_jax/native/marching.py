@@ -5,7 +5,7 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-from subterra_jax.lidar3d.cells import FACES, MARGIN, N_FACES, N_WEDGES, NEAR_UNIT, STEP_BITS, X_BITS
+from subterra_jax.lidar3d.cells import FACES, MARGIN, N_FACES, N_WEDGES, N_X, NEAR_UNIT, STEP_BITS, X_BITS
 from subterra_jax.lidar3d.meeting import FINE, PAST, SEAM
 from subterra_jax.lidar3d.relief import N_FRAME, N_LINK
 from subterra_jax.native.threads import argument, result_of_many
@@ -127,17 +127,11 @@ def _leap(prism, y, z, dy, dz):
 
 @compiled
 @no_type_check
-def _cross_cells(numbers, first_vertex, first_cell, cell, entry, vertex, n_x, p, d, stop):
-    """Take a ray through the cells of one block.
+def _cross_cells(numbers, first_vertex, first_cell, cell, entry, vertex, p, d, stop):
+    """Take a ray through the cells of one block, from a place `p` of its frame, m, in a direction `d`.
 
     Args:
         numbers: Numbers of the block from the least place along the axis on, see `N_FRAME`.
-        cell: The relief's cells; `entry` and `vertex` as well.
-        entry: Entries.
-        vertex: Vertices.
-        n_x: Cells of a block along the axis.
-        p: Place at which the ray begins, block's frame, m.
-        d: Direction.
         stop: Largest distance of interest, m.
 
     Returns:
@@ -149,13 +143,13 @@ def _cross_cells(numbers, first_vertex, first_cell, cell, entry, vertex, n_x, p,
     start, forward = (p[0] - low) * per_cell, 1 if d[0] > _ZERO else 0
     slope = _ONE / ((_F(1e-9) if abs(d[0]) < _F(1e-9) else d[0]) * per_cell)
     onward = p[1] * d[2] - p[2] * d[1] > _ZERO
-    x = int(min(max(start, _ZERO), _F(n_x - 1)))
+    x = int(min(max(start, _ZERO), _F(N_X - 1)))
     share = p[1] / max(abs(p[1]) + abs(p[2]), _F(1e-30))
     wedge = min(max(int((_ONE - share if p[2] >= _ZERO else _F(3.0) + share) * _PER_TURN), 0), N_WEDGES - 1)
     place, best, which = _ZERO, _FAR, -1
     while True:
         end = x + forward
-        leave_x = _FAR if end <= 0 or end >= n_x else (_F(end) - start) * slope
+        leave_x = _FAR if end <= 0 or end >= N_X else (_F(end) - start) * slope
         (y0, z0), (y1, z1) = _edge(_F(wedge) / _PER_TURN), _edge(_F(wedge + 1) / _PER_TURN)
         y, z = (y1, z1) if onward else (y0, z0)
         speed = y * d[2] - z * d[1]
@@ -183,12 +177,12 @@ def _cross_cells(numbers, first_vertex, first_cell, cell, entry, vertex, n_x, p,
 @compiled
 @no_type_check
 def march_rows(results, operands, begin, end):
-    """March the rays `begin` to `end` of a call: origin, direction, block, limit, a relief's arrays, n_x to `Hits`."""
+    """March the rays `begin` to `end` of a call: origin, direction, block, limit, a relief's arrays to `Hits`."""
     origin, direction = argument(operands, 0), argument(operands, 1)
     block, limit = argument(operands, 2).view(_I), argument(operands, 3)
     frame, link = argument(operands, 4), argument(operands, 5).view(_I)
     cell, entry = argument(operands, 6).view(_I), argument(operands, 7).view(_I)
-    vertex, box, n_x = argument(operands, 8).view(_I), argument(operands, 9), argument(operands, 10).view(_I)[0]
+    vertex, box = argument(operands, 8).view(_I), argument(operands, 9)
     distance, found = result_of_many(results, 0, len(block)), result_of_many(results, 1, len(block)).view(_I)
     home = result_of_many(results, 2, len(block)).view(_I)
     for ray in range(begin, end):
@@ -216,7 +210,7 @@ def march_rows(results, operands, begin, end):
             stop = min(min(leave, farthest), hit) - start
             if stop >= _ZERO:
                 best, number = _cross_cells(
-                    frame[f + 20 :], np.int64(link[k + 2]), np.int64(link[k + 3]), cell, entry, vertex, n_x,
+                    frame[f + 20 :], np.int64(link[k + 2]), np.int64(link[k + 3]), cell, entry, vertex,
                     _on(q, start - reached, d), d, stop,
                 )  # fmt: skip
                 if start + best < hit:

@@ -51,12 +51,6 @@ def wall_brightness(
 def intensity(
     cosine: Float[Array, "n"], reflectivity: Float[Array, "n"], normal: Float[Array, "n"], full: float = FULL_SCALE
 ) -> Float[Array, "n"]:
-    """Return reported intensities, whole numbers up to 255, with 5 % noise.
-
-    Args:
-        cosine: Cosine of incidence, 0 to 1.
-        reflectivity: Reflectivity of what is met.
-        full: Reported for 100 % diffuse.
-    """
+    """Return reported intensities, whole numbers up to 255, with 5 % noise; 100 % diffuse gives `full`."""
     value: Any = full * reflectivity * cosine * (1.0 + SCALE_SIGMA * normal)
     return jnp.clip(jnp.round(value), 0.0, MOST)

@@ -13,9 +13,9 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, UInt32
 
 from subterra_jax import constants
-from subterra_jax.parts.hashing import uniform
 from subterra_jax.parts.odometer import OdometryState
 from subterra_jax.parts.part import Batch, Drive, Keys, Noise, Part, SensingState, Step
+from subterra_jax.parts.slip import uniform_at
 from subterra_jax.parts.unicycle import wrap
 from subterra_jax.state import EnvParams, State
 
@@ -93,7 +93,7 @@ def sensing(
 def grip(state: FaultState, station: Float[Array, ""], params: FaultParams) -> Float[Array, ""]:
     """Return true speed over wheel speed at a station: 1 on dry rail."""
     patch = jnp.floor(station / PATCH).astype(jnp.int32)
-    wet = uniform(state.seed, patch, _WET) < params.wet_share * _share(state)
+    wet = uniform_at(state.seed, patch, _WET) < params.wet_share * _share(state)
     return jnp.where(wet, 1.0 - params.wet_loss, 1.0)
 
 

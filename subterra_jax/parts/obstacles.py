@@ -9,8 +9,8 @@ from flax import struct
 from jaxtyping import Array, Float, Int, UInt32
 
 from subterra_jax import constants
-from subterra_jax.parts.hashing import uniform
 from subterra_jax.parts.part import Batch, Keys, Part, SensingState
+from subterra_jax.parts.slip import uniform_at
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel import Tunnel, at_station
 
@@ -95,9 +95,9 @@ def boxes_in(seed: UInt32[Array, ""], slot: Int[Array, "n"], tunnel: Tunnel, par
 
     Equal seeds give equal boxes. `params.first` is a station here, m.
     """
-    u = lambda index: uniform(seed, slot, index)  # noqa: E731
+    u = lambda index: uniform_at(seed, slot, index)  # noqa: E731
     n_slots = jnp.maximum(jnp.floor(tunnel.length / PITCH), 2.0)
-    trolley = slot == 1 + jnp.floor(uniform(seed, jnp.zeros((), jnp.int32), 9) * (n_slots - 1.0)).astype(jnp.int32)
+    trolley = slot == 1 + jnp.floor(uniform_at(seed, jnp.zeros((), jnp.int32), 9) * (n_slots - 1.0)).astype(jnp.int32)
     side = 0.5 * (params.size_min + (params.size_max - params.size_min) * jnp.stack([u(0), u(1)], axis=-1))
     parked = 0.5 * jnp.stack([jnp.asarray(params.trolley_length), jnp.asarray(params.trolley_width)])
     half = jnp.where(trolley[:, None], parked[None], side)

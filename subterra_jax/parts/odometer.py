@@ -11,8 +11,8 @@ from jaxtyping import Array, Bool, Float
 
 from subterra_jax import constants
 from subterra_jax.parts.part import Batch, Bounds, Keys, Noise, Part, SensingState, Step
+from subterra_jax.parts.slip import WanderParams, advance_wander
 from subterra_jax.parts.unicycle import wrap
-from subterra_jax.parts.wander import WanderParams, advance_wander
 from subterra_jax.state import EnvParams, State
 
 

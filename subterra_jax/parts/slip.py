@@ -1,4 +1,4 @@
-"""Slip between the command and the true motion."""
+"""Slip between the command and the true motion; errors that wander over the distance, and random numbers of a place."""
 
 import dataclasses
 from typing import Any, ClassVar
@@ -6,12 +6,42 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int, UInt32
 
 from subterra_jax import constants
 from subterra_jax.parts.part import Batch, Drive, Keys, Noise, Part, Step
-from subterra_jax.parts.wander import WanderParams, advance_wander
 from subterra_jax.state import EnvParams, State
+
+
+@struct.dataclass
+class WanderParams:
+    """A stationary Ornstein-Uhlenbeck process over distance, which starts with a normal number of `sigma`.
+
+    Attributes:
+        sigma: Standard deviation at any place, in the unit of the error.
+        length: Distance over which its correlation falls to 1/e, m.
+    """
+
+    sigma: float
+    length: float = constants.WANDER_LENGTH
+
+
+def advance_wander(
+    value: Float[Array, ""], travelled: Float[Array, ""], noise: Float[Array, ""], params: WanderParams
+) -> Float[Array, ""]:
+    """Return the value a distance further on; unchanged where nothing was travelled.
+
+    Args:
+        travelled: Distance, m; its sign does not matter.
+
+    Source: Gillespie 1996, Exact numerical simulation of the Ornstein-Uhlenbeck process.
+    """
+    ratio = jnp.abs(travelled) / params.length
+    # The root has no derivative at 0: a standing robot gets 0, and neither branch a NaN.
+    moves = ratio > 0.0
+    # expm1, because 1 - exp(-x) has few digits left at a step of 0.2 m in 30 m.
+    share = jnp.where(moves, jnp.sqrt(-jnp.expm1(-2.0 * jnp.where(moves, ratio, 1.0))), 0.0)
+    return jnp.exp(-ratio) * value + params.sigma * share * noise
 
 
 @struct.dataclass
@@ -76,3 +106,24 @@ class Slip(Part):
     def privileged(self, own: SlipState) -> dict[str, Array]:
         """Return the slip of the speed (1) and of the yaw rate (rad/s)."""
         return {"slip": own.gain + own.wander, "yaw_slip": own.yaw}
+
+
+def uniform_at(seed: UInt32[Array, ""], slot: Int[Array, "*n"], index: int) -> Float[Array, "*n"]:
+    """Return uniform numbers in [0, 1) of places: equal for equal seed and slot, and never stored.
+
+    Args:
+        seed: Seed of the episode.
+        slot: Places.
+        index: Number of the draw at a place; any small constant.
+
+    Source: the finaliser of MurmurHash3 (Appleby), twice, because slots are consecutive.
+    """
+    mixed = slot.astype(jnp.uint32) * jnp.uint32(0x9E3779B1) + jnp.uint32((index * 0x85EBCA77 + 1) & 0xFFFFFFFF)
+    mixed = _finish(_finish(mixed) ^ seed)
+    return (mixed >> 8).astype(jnp.float32) * jnp.float32(2.0**-24)
+
+
+def _finish(bits: UInt32[Array, "*n"]) -> UInt32[Array, "*n"]:
+    bits = (bits ^ (bits >> 16)) * jnp.uint32(0x85EBCA6B)
+    bits = (bits ^ (bits >> 13)) * jnp.uint32(0xC2B2AE35)
+    return bits ^ (bits >> 16)

@@ -55,7 +55,6 @@ class SpatialParams:
 
     @property
     def remembers(self) -> bool:
-        """True where the pose before the step is needed."""
         return self.sweep or self.doppler
 
     @property
@@ -164,14 +163,7 @@ class Sweeping:
 def along_arc(
     begun: Sweeping, position: Float[Array, "2"], heading: Float[Array, ""], share: Float[Array, "n"]
 ) -> tuple[Float[Array, "n 2"], Float[Array, "n"]]:
-    """Return poses on the way from one pose to another, along the arc of a constant speed and yaw rate.
-
-    Args:
-        begun: First pose.
-        position: Last position, tunnel frame, m.
-        heading: Last heading, rad.
-        share: Share of the way, 0 to 1.
-    """
+    """Return poses (m, rad) at shares of the way from one pose to another, by a constant speed and yaw rate."""
     turn = wrap(heading - begun.heading)
     chord_x, chord_y = position[0] - begun.position[0], position[1] - begun.position[1]
     small = jnp.abs(turn) < 1e-3
@@ -211,7 +203,6 @@ class SpatialLidar(Part):
         return Sweeping(state.position, state.heading) if params.lidar.remembers else ()
 
     def advance(self, own: Any, step: Step, noise: Noise, params: EnvParams) -> Any:
-        """Keep the pose before the step."""
         return Sweeping(step.before.position, step.before.heading) if params.lidar.remembers else own
 
     def poses(
@@ -239,8 +230,6 @@ class SpatialLidar(Part):
         """Return the nearest surfaces, the cosines of incidence, the rays, and their origins.
 
         Args:
-            own: State of the part.
-            sensing: Moment that is shown.
             uniform: Numbers for the sides of the rims; read where pixels are mixed.
         """
         sensor = params.lidar

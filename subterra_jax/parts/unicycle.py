@@ -37,11 +37,7 @@ class VehicleParams:
 
 
 def clip_action(action: Float[Array, "2"], params: VehicleParams) -> Float[Array, "2"]:
-    """Clip a command `[v, ω]` to the robot's limits; a NaN is read as 0.
-
-    Args:
-        action: Needed forward speed (m/s) and yaw rate (rad/s, counter-clockwise); anything at all.
-    """
+    """Clip a command, m/s and rad/s counter-clockwise, to the robot's limits; a NaN is read as 0."""
     limit = jnp.stack([params.speed_max, params.yaw_rate_max])
     floor = jnp.stack([jnp.zeros_like(limit[0]), -limit[1]])
     return jnp.clip(jnp.where(jnp.isnan(action), 0.0, action), floor, limit)
@@ -56,16 +52,9 @@ def wrap(angle: Float[Array, ""]) -> Float[Array, ""]:
 def follow_arc(
     position: Float[Array, "2"], heading: Float[Array, ""], command: Float[Array, "2"], period: Float[Array, ""]
 ) -> tuple[Float[Array, "2"], Float[Array, ""]]:
-    """Move along the exact arc of a constant command.
+    """Return position (m) and heading (rad) after the exact arc of a constant command, m/s and rad/s, for a period, s.
 
-    Args:
-        position: Position, tunnel frame, m.
-        heading: Heading, rad.
-        command: Speed (m/s) and yaw rate (rad/s).
-        period: Duration, s.
-
-    Returns:
-        Position and heading afterwards. Speed 0 turns on the spot; yaw rate 0 is a straight line, not a division by 0.
+    Speed 0 turns on the spot; yaw rate 0 is a straight line, not a division by 0.
     """
     half_turn = 0.5 * command[1] * period
     small = jnp.abs(half_turn) < 1e-2
@@ -77,14 +66,9 @@ def follow_arc(
 
 
 def clearance(tunnel: Tunnel, position: Float[Array, "2"], station: Float[Array, ""]) -> Float[Array, ""]:
-    """Measure the distance from a point to the nearest wall or furniture segment.
+    """Measure the distance from a point (m, at a station, m) to the nearest wall or furniture, m.
 
-    Args:
-        position: The point, tunnel frame, m.
-        station: Its station, m.
-
-    Returns:
-        Distance, m; exact up to 0.8 m, and exactly that where the truth is beyond.
+    It is exact up to 0.8 m, and exactly that where the truth is beyond.
     """
     node = node_at(tunnel, station)
     # The kernels know 32 bits.

@@ -33,9 +33,7 @@ class View(Protocol):
         """Return a picture, `(height, width, 3)` uint8, of a state and its observation `(n_obs,)`."""
         ...
 
-    def close(self) -> None:
-        """Release the renderer, if there is one."""
-        ...
+    def close(self) -> None: ...
 
 
 def make_view(view: str, choice: TunnelChoice | None = None) -> View:

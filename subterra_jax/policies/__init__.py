@@ -14,7 +14,6 @@ from subterra_jax.policies.loading import (
     from_tensors,
     load,
     training_conditions,
-    with_map,
 )
 from subterra_jax.policies.opening import open_agent
 
@@ -34,5 +33,4 @@ __all__ = [
     "open_agent",
     "released",
     "training_conditions",
-    "with_map",
 ]

@@ -76,7 +76,6 @@ class DrivingPolicy:
 
     @property
     def name(self) -> str:
-        """Name on the leaderboard."""
         return self.agent.name
 
     @in_32_bits()
@@ -88,7 +87,6 @@ class DrivingPolicy:
         return DrivingMemory(keys, jnp.zeros(size, jnp.int32), _blank(self, size))
 
     def restart(self, memory: DrivingMemory, done: Bool[Array, "*env"]) -> DrivingMemory:
-        """Returns the memory, with a new key and no steps where an episode has ended."""
         if jnp.ndim(done):
             return jax.vmap(self.restart)(memory, done)
         key = jnp.where(done, jax.random.fold_in(memory.key, 2**31 - 1), memory.key)
@@ -141,7 +139,6 @@ def _zeros(leaf: jax.ShapeDtypeStruct, size: tuple[int, ...]) -> Array:
 
 
 def _as(memory: Any, like: Any) -> Any:
-    """Returns a memory in the types of another, so that a scan may carry it."""
     return jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), memory, like)
 
 

@@ -1,4 +1,4 @@
-"""The agent of a trained network: it takes in what training took in, and drives by the mean of the distribution."""
+"""The agent of a trained network, and its layout: it takes in what training took in, and drives by the mean."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -13,17 +13,53 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from subterra_jax.baselines.agent import Action, Known, Observed, observed
 from subterra_jax.baselines.histogram import HistogramLocaliser
 from subterra_jax.episode import in_tunnel
+from subterra_jax.policies import inputs
 from subterra_jax.policies.files import Conditions, PolicyError
-from subterra_jax.policies.layout import Layout
 from subterra_jax.policies.locate.map_strip import MapStrip
-from subterra_jax.policies.memories import Kept
-from subterra_jax.policies.network import Network, init, start_memory, to_action
+from subterra_jax.policies.memories import MEMORIES, Kept, Memory
+from subterra_jax.policies.network import Network, Shape, init, start_memory, to_action
 from subterra_jax.policies.trained import Tensors, Trained, nested, part
 from subterra_jax.state import EnvParams
 from subterra_jax.tunnel_env import TunnelEnv
 
 KIND = "ppo"
 NETWORK, LOCALISER = "network", "localiser"
+
+
+@dataclasses.dataclass(frozen=True)
+class Layout:
+    """Everything about a policy that is no weight."""
+
+    memory: Memory  # what is kept between observations
+    shape: Shape  # sizes of the network
+    action_low: tuple[float, ...]  # smallest action, m/s and rad/s
+    action_high: tuple[float, ...]  # largest action, m/s and rad/s
+    standing: float = 0.5  # share of the largest speed by which the range of the tanh goes below 0
+
+    def to_json(self) -> dict[str, Any]:
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> "Layout":
+        """Reads a layout.
+
+        Raises:
+            KeyError: Something is missing.
+            TypeError: Something is not known.
+            ValueError: There is no such memory.
+        """
+        own = {field.name for field in dataclasses.fields(Memory)}
+        memory = Memory(**{name: value for name, value in values["memory"].items() if name in own})
+        shape = dict(values["shape"])
+        if memory.kind not in MEMORIES:
+            raise ValueError(f"memory must be one of {', '.join(MEMORIES)}, got {memory.kind!r}")
+        shape["hidden"] = tuple(shape["hidden"])
+        low, high = tuple(values["action_low"]), tuple(values["action_high"])
+        return cls(memory, Shape(**shape), low, high, float(values["standing"]))
+
+    def reckoned_way(self, seen: Float[Array, "n"]) -> Float[Array, ""]:
+        """Returns the reckoned way to go among the inputs of one observation, m."""
+        return inputs.FAR * seen[inputs.WAY_AT]
 
 
 @struct.dataclass
@@ -65,7 +101,6 @@ class Learnt(Trained):
         self.check_tensors(needed)
 
     def check_task(self, env: TunnelEnv, params: EnvParams, source: str | Path) -> None:
-        """Refuses an observation of another size, and an action of another."""
         memory, here = self.layout.memory, in_tunnel(env, params, 0)
         given = (self.with_map(params) if self._filters else self).given
 
@@ -102,7 +137,6 @@ class Learnt(Trained):
     def act(
         self, key: PRNGKeyArray, memory: LearntMemory, obs: Observed, params: EnvParams, known: Known
     ) -> tuple[Action, LearntMemory]:
-        """Returns command and estimate of one control period, and the memory after it."""
         own = self.layout.memory
         kept = own.take(memory.kept, memory.command, obs, params, self.given)
         variables = {"params": nested(part(self.tensors, f"{NETWORK}."))}

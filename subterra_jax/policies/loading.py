@@ -61,11 +61,6 @@ def from_tensors(
     return KINDS[kind].of_layout(layout, tensors=arrays, low=low, high=high, name=name, conditions=conditions)
 
 
-def with_map(agent: Any, params: EnvParams) -> Any:
-    """Returns the agent with the map of a task if it uses one, any other unchanged."""
-    return agent.with_map(params) if isinstance(agent, Trained) else agent
-
-
 def check_fits(agent: Trained, env: TunnelEnv, params: EnvParams, source: str | Path) -> None:
     """Refuses a policy that cannot drive here, or was trained under other conditions.
 

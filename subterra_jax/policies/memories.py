@@ -103,10 +103,7 @@ class Memory:
     ) -> Float[Array, "3"]:
         """Returns station (m), log of its standard deviation (m) and direction at the end of a command.
 
-        Args:
-            kept: What is kept.
-            command: The command, m/s and rad/s.
-            obs: The observation that it answers; not needed where a localiser estimates the station.
+        The observation that it answers is not needed where a localiser estimates the station.
         """
         station, log_sigma, direction = self._estimate(kept, obs, params)
         return jnp.stack([station + direction * command[0] * params.vehicle.period, log_sigma, direction])

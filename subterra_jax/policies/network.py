@@ -123,24 +123,13 @@ class Network(nn.Module):
             self.head = Perceptron((shape.hidden[-1], 2), 0.1)
 
     def __call__(self, x: Float[Array, "*batch n"], memory: Any) -> tuple[Outputs, Any]:
-        """Returns the answers to one step, and the memory after it.
-
-        Args:
-            x: Inputs.
-            memory: Of the GRU, `(*batch, cell)`; returned unchanged without one.
-        """
+        """Returns the answers to one step, and the GRU's memory after it; unchanged without one."""
         if self.shape.cell:
             memory = self.cell(x, memory)
         return self._answer(x, memory), memory
 
     def unroll(self, x: Float[Array, "time env n"], memory: Any, first: Bool[Array, "time env"]) -> Outputs:
-        """Returns the answers to every step of a rollout.
-
-        Args:
-            x: Inputs.
-            memory: Memory before the first step.
-            first: The step begins an episode.
-        """
+        """Returns the answers to every step of a rollout; `first` where an episode begins."""
         if self.shape.cell:
             memory = self.cell.unroll(x, memory, first)
         return self._answer(x, memory)
@@ -177,20 +166,17 @@ def act(actor: Weights, x: Float[Array, "*batch n"]) -> Float[Array, "*batch act
     """
     hidden = [actor[f"hidden_{i}"]["bias"].shape[0] for i in range(len(actor) - 1)]
     widths = (*hidden, actor["out"]["bias"].shape[0])
-    return Perceptron(widths, 1.0).apply({"params": actor}, x)  # type: ignore[return-value]
+    mean: Any = Perceptron(widths, 1.0).apply({"params": actor}, x)
+    return mean
 
 
 def to_action(
     raw: Float[Array, "*batch action"], low: Float[Array, "action"], high: Float[Array, "action"], standing: float
 ) -> Float[Array, "*batch action"]:
-    """Returns the action of a draw of the Gaussian, within its bounds.
+    """Returns the action of a draw of the Gaussian, within its bounds, m/s and rad/s.
 
-    Args:
-        raw: The draw, before the tanh.
-        low: Smallest action, m/s and rad/s.
-        high: Largest action, m/s and rad/s.
-        standing: A range that begins at 0 is stretched below it by this share of its end, and clipped: to stand is then
-            a region and not the limit of a tanh.
+    A range that begins at 0 is stretched below it by a share `standing` of its end, and clipped: to stand is then a
+    region and not the limit of a tanh.
     """
     lowest = jnp.where(low == 0.0, -standing * high, low)
     return jnp.clip(lowest + 0.5 * (jnp.tanh(raw) + 1.0) * (high - lowest), low, high)

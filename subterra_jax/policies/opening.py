@@ -10,7 +10,7 @@ from subterra_jax.baselines.registry import AgentError
 from subterra_jax.compiled import in_32_bits
 from subterra_jax.host.loading import load_object
 from subterra_jax.policies.files import PolicyError, is_policy
-from subterra_jax.policies.loading import PREFIX, check_fits, load, with_map
+from subterra_jax.policies.loading import PREFIX, check_fits, load
 from subterra_jax.policies.trained import Trained
 from subterra_jax.state import EnvParams
 from subterra_jax.tunnel_env import TunnelEnv
@@ -52,14 +52,13 @@ def open_agent(source: Any, env: TunnelEnv, params: EnvParams) -> Agent:
     agent = _make(source, params)
     if isinstance(agent, Trained):
         check_fits(agent, env, params, str(source) if isinstance(source, (str, Path)) else agent.name)
-        return with_map(agent, params)
+        return agent.with_map(params)
     if missing := [one for one in (*TRAITS, "name", "begin", "act") if not hasattr(agent, one)]:
         raise AgentError(f"agent {str(source)!r} has no {', '.join(missing)}")
     return agent
 
 
 def _make(source: Any, params: EnvParams) -> Any:
-    """Makes the agent, not yet checked against the task."""
     if not isinstance(source, (str, Path)):
         return call_factory(source, params) if callable(source) else source
     name = str(source)

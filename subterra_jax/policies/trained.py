@@ -105,7 +105,6 @@ class Trained(Agent):
         return self._with(map=None, hides_map=True, name=f"{self.name}, no map")
 
     def without_walls(self) -> Self:
-        """Returns the agent with the same weights, and nothing that the walls tell its localiser."""
         return self._with(map=None, blind=True, name=f"{self.name}, cut")
 
     def _with(self, **changes: Any) -> Self:

@@ -61,12 +61,7 @@ class Bore:
         return min((self.bench_edge(bench) for bench in met), default=np.inf)
 
     def radius(self, columns: Int[np.ndarray, " c"] | None = None, smooth: bool = False) -> Float[np.ndarray, "n c"]:
-        """Return the distance of wall and floor from the axis at all stations, m.
-
-        Args:
-            columns: Angles of the grid; `None` for all.
-            smooth: Leave out all relief.
-        """
+        """Return distances of wall and floor from the axis at all stations and some angles, m; smooth has no relief."""
         columns = np.arange(N_ANGLES) if columns is None else columns
         wall = np.repeat(self.outline[None, columns], len(self.grid.station), axis=0)
         if not smooth:

@@ -22,10 +22,7 @@ Cut = dict[str, Float[np.ndarray, " n"]]
 
 
 def plane_walls(bore: Bore, smooth: bool = False) -> Cut:
-    """Return the cut of the wall, without pockets and fixtures.
-
-    Args:
-        smooth: Leave out all relief.
+    """Return the cut of the wall without pockets and fixtures, or without any relief.
 
     Returns:
         By side: distance from the axis at the stations of the bore's grid, m, `(n,)`.

@@ -183,15 +183,7 @@ def overlaps(
     low: Float[np.ndarray, " p"],
     high: Float[np.ndarray, " p"],
 ) -> Bool[np.ndarray, " p"]:
-    """Return which rectangles on the walls overlap one of the boxes.
-
-    Args:
-        side: Wall of each rectangle, 1 left, -1 right.
-        start: Station where it begins, m.
-        end: Station where it ends, m.
-        low: Lower edge, m.
-        high: Upper edge, m.
-    """
+    """Return which rectangles on the walls (side 1 left, -1 right; stations, m; edges, m) overlap one of the boxes."""
     hit = np.zeros(len(side), bool)
     order = np.argsort(start)
     longest = float(np.max(end - start, initial=0.0))

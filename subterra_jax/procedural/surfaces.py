@@ -172,14 +172,7 @@ class Layer(Protocol):
 def draw_layers(
     rng: np.random.Generator, kind: Kind, length: float, radius: float, around: float, bolts: int
 ) -> list[Layer]:
-    """Draw the relief of a kind of lining.
-
-    Args:
-        length: Length of the tunnel, m.
-        radius: Half its width, m.
-        around: Girth of its section, m.
-        bolts: Bolts around a ring joint.
-    """
+    """Draw the relief of a kind of lining: length of the tunnel, half its width, girth, m; bolts of a ring joint."""
     surface = kind.surface
     layers: list[Layer] = []
     if kind.rings is not None:

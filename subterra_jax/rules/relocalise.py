@@ -54,7 +54,6 @@ class Relocalise(GoalRule):
         return {"ring_pitch": tunnel.ring_pitch}
 
     def judge(self, step: Step, params: EnvParams) -> Verdict:
-        """Judge the report against the place where the robot stands."""
         goal = step.before.goal
         still, stopped = count_still(step, params.goal)
         along = step.place.tangent

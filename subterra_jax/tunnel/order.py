@@ -97,7 +97,7 @@ def windows(plan: TunnelPlan, blocks: Blocks, reach: float) -> tuple[np.ndarray,
     slack = np.full(len(plan.station), 0.6 * spacing + 0.01)
     slack[[0, -1]] += 0.5
     normal = np.stack([-plan.tangent[:, 1], plan.tangent[:, 0]], axis=-1)
-    node, block = _within(plan.centre, plan.half_width[:, None] * normal, np.zeros(len(slack)), blocks, reach + slack)
+    node, block = _within(plan.centre, plan.half_width[:, None] * normal, blocks, reach + slack)
     first = np.full(len(plan.station), len(blocks.centre) - 1)
     last = np.zeros(len(plan.station), int)
     np.minimum.at(first, node, block)
@@ -110,32 +110,22 @@ def windows(plan: TunnelPlan, blocks: Blocks, reach: float) -> tuple[np.ndarray,
 def _within(
     middle: Float[np.ndarray, "n 2"],
     half: Float[np.ndarray, "n 2"],
-    thickness: Float[np.ndarray, " n"],
     blocks: Blocks,
     limit: Float[np.ndarray, " n"],
 ) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"]]:
-    """Find pairs of a thin box `middle ± half` and a block within a distance of one another.
+    """Return numbers of the pairs of a line `middle ± half` and a block within a distance of one another, m.
 
-    Both may be thicker than a line. A wall behind a lid is at most a pocket further away than the box, never nearer.
-
-    Args:
-        middle: Middle of each box, m.
-        half: Half the long axis of each box, m.
-        thickness: Half the thickness of each box, m.
-        limit: Distance for each box, m.
-
-    Returns:
-        Numbers of the box and of the block of each pair.
+    A wall behind a lid is at most a pocket further away than the block's box, never nearer.
     """
     length, size = np.hypot(*half.T), np.hypot(*blocks.half.T)
     found = []
     for first in range(0, len(middle), _ROWS):
         rows = slice(first, first + _ROWS)
-        most = (limit[rows] + thickness[rows]).max() + (size + blocks.thickness).max() + length[rows].max()
+        most = limit[rows].max() + (size + blocks.thickness).max() + length[rows].max()
         low, high = middle[rows].min(axis=0) - most, middle[rows].max(axis=0) + most
         near = np.flatnonzero(np.all((blocks.centre >= low) & (blocks.centre <= high), axis=1))
         x, y = (middle[rows, i, None] - blocks.centre[near, i] for i in range(2))
-        room = (limit + thickness)[rows, None] + blocks.thickness[near]
+        room = limit[rows, None] + blocks.thickness[near]
         squared, surely = x * x + y * y, np.maximum(room, 0.0)
         maybe = surely + length[rows, None] + size[near]
         sure = squared <= surely * surely

@@ -91,8 +91,8 @@ def unpack(words: Sequence[Array]) -> tuple[Array, ...]:
 
 
 def _two(word: Array) -> tuple[Array, Array]:
-    halves = word & jnp.int32(-(1 << 16)), word << 16
-    return tuple(jax.lax.bitcast_convert_type(half, jnp.float32) for half in halves)  # type: ignore[return-value]
+    upper, lower = word & jnp.int32(-(1 << 16)), word << 16
+    return jax.lax.bitcast_convert_type(upper, jnp.float32), jax.lax.bitcast_convert_type(lower, jnp.float32)
 
 
 def _nearest(number: np.ndarray) -> np.ndarray:

@@ -21,6 +21,8 @@ CONTACT_REACH = 0.8
 FARTHEST = 2.0**14  # m from the origin: up to there neighbouring numbers of 32 bits are less than 1 mm apart
 GROUP = 16  # blocks that a CPU looks at together; there are twice as many of padding on either side of a tunnel
 WIDTH = 16  # segments that a CPU looks at together
+BLOCK_LENGTH, MOST_SEGMENTS = 2.0, 16  # of a block of wall: m, about; they affect speed alone
+# Boxes sorted by where a beam enters them; speed alone. Beside furniture it enters more without touching what is there.
 _CANDIDATES, _CANDIDATES_FURNISHED = 3, 8
 
 
@@ -53,7 +55,7 @@ class Tunnel:
         n_scan: Blocks in a scan window. Every window, counted up to the next power of two, holds blocks of one tunnel,
             padding, or nothing.
         n_contact: Blocks in a contact window.
-        n_candidates: Boxes that are sorted by where a beam enters them; affects speed alone.
+        n_candidates: Boxes that XLA sorts by where a beam enters them; affects speed alone.
         space: Surface and ground, a `lidar3d.space.Space`, for LiDARs in three dimensions; `None` without one.
         packed: Boxes and walls as GPUs read them, a `Packed`. `None` in a tunnel whose `box` or `wall` was replaced:
             XLA casts there.
@@ -119,19 +121,12 @@ class Tunnel:
         lining: str | None = None,
         *,
         reach: float = 30.0,
-        block_length: float = 2.0,
-        max_segments: int = 16,
-        n_candidates: int | None = None,
     ) -> "Tunnel":
         """Put a plan on the device.
 
         Args:
             lining: Variant of its walls; `None` is `pockets`, or the first if there is none of that name.
             reach: Largest LiDAR range, m.
-            block_length: Target length of the blocks of wall, m; affects speed alone.
-            max_segments: Most wall segments in one block; affects speed alone.
-            n_candidates: Boxes that are sorted by where a beam enters them; affects speed alone. `None` is 3, and 8
-                with furniture, beside which a beam enters more boxes without touching what is in them.
 
         Raises:
             TunnelError: The plan does not have the lining, or lies so far from its origin that 32 bits blur it.
@@ -142,9 +137,7 @@ class Tunnel:
                 f"tunnel {plan.name!r} reaches {far:.0f} m from the origin of its coordinates, where 32 bits blur "
                 f"millimetres: shift it to within {FARTHEST:.0f} m"
             )
-        blocks = build_blocks(plan, walls, block_length, max_segments)
-        if n_candidates is None:
-            n_candidates = _CANDIDATES if len(walls.furniture) == 0 else _CANDIDATES_FURNISHED
+        blocks = build_blocks(plan, walls, BLOCK_LENGTH, MOST_SEGMENTS)
         scan_first, in_window = windows(plan, blocks, reach)
         contact_first, in_contact = windows(plan, blocks, CONTACT_REACH)
         visits, n_scan = order(plan, blocks, scan_first, in_window), int(in_window.max())
@@ -176,7 +169,7 @@ class Tunnel:
             reach=reach,
             n_scan=n_scan,
             n_contact=int(in_contact.max()),
-            n_candidates=n_candidates,
+            n_candidates=_CANDIDATES if len(walls.furniture) == 0 else _CANDIDATES_FURNISHED,
             packed=jax.device_put(pack(box, wall, count)),
         )
 
@@ -224,15 +217,11 @@ def beside(
 
 
 def foot(tunnel: Tunnel, position: Float[Array, "2"], near: Float[Array, ""]) -> Foot:
-    """Return the foot of the perpendicular from a point to the centreline, searched near a known station.
+    """Return the foot of the perpendicular from a point (m) to the centreline.
 
-    Args:
-        position: The point, tunnel frame, m.
-        near: A station within about half a metre of the answer, m, such as the previous one.
-
-    Returns:
-        The foot. Each of the two passes shrinks the error by lateral offset over radius of curvature: from 0.2 m to
-        0.3 mm in a bend of 60 m, 2.4 m off the centreline.
+    It is searched near a station within about half a metre of the answer, m, such as the previous one. Each of the two
+    passes shrinks the error by lateral offset over radius of curvature: from 0.2 m to 0.3 mm in a bend of 60 m, 2.4 m
+    off the centreline.
     """
     station = near
     for _ in range(2):

@@ -14,7 +14,7 @@ from subterra_jax.baselines.registry import make_agent
 from subterra_jax.baselines.stations import Station
 from subterra_jax.baselines.steering import Avoidance
 from subterra_jax.evaluation import evaluate, listed_episodes
-from subterra_jax.parts.wander import WanderParams
+from subterra_jax.parts.slip import WanderParams
 
 
 @pytest.fixture(scope="module")

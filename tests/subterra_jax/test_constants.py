@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from subterra_jax import digest, tasks
-from subterra_jax.digest import task_figures
+from subterra_jax import tasks
 from subterra_jax.host.task_ids import PLANAR
+from subterra_jax.params import task_figures
 from subterra_jax.procedural import open_world
 from subterra_jax.rules import StartParams
 
@@ -61,7 +61,7 @@ def test_a_walking_task_has_its_numbers_whatever_its_policy(id):
 
 def test_a_renamed_field_keeps_its_key(monkeypatch):
     env, params = st.make("Subterra/StopAt-v1", tunnel="control")
-    monkeypatch.setattr(digest, "RENAMED", {"goal.low": "goal.least", "slip": "skid"})
+    monkeypatch.setattr("subterra_jax.params.RENAMED", {"goal.low": "goal.least", "slip": "skid"})
     found = task_figures(env, params)
     assert {"goal.least", "skid.gain_sigma"} <= set(found["numbers"])
     assert "goal.low" not in found["numbers"]

@@ -10,15 +10,14 @@ import pytest
 from flax import struct
 
 import subterra_jax as st
-from subterra_jax.baselines.fused import FusedCount
 from subterra_jax.baselines.navigator import Navigator
+from subterra_jax.baselines.stations import FusedCount
 from subterra_jax.baselines.steering import CentreLine
 from subterra_jax.evaluation import Episodes, evaluate
 from subterra_jax.evaluation.floor import floor, is_above, way_back_variance, way_out_variance
 from subterra_jax.parts import Part
 from subterra_jax.parts.odometer import OdometryParams
-from subterra_jax.parts.slip import SlipParams
-from subterra_jax.parts.wander import WanderParams
+from subterra_jax.parts.slip import SlipParams, WanderParams
 
 NONE = WanderParams(sigma=0.0)
 DISTANCE = np.array([60.0, 150.0, 270.0])

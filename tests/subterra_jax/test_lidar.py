@@ -1,5 +1,6 @@
 """Planar LiDAR: analytic rooms, and float64 brute force over every segment of the same walls."""
 
+import dataclasses
 from functools import partial
 
 import jax
@@ -110,7 +111,8 @@ def test_furniture_along_a_wall_is_exact(plan_of):
 def test_a_beam_along_a_row_of_deep_recesses_is_exact(fused, n_candidates):
     """Refuges in masonry, each in a box as thick as it is long: a beam along the wall enters up to 16 of them."""
     plan = load_tunnel("open:masonry:train:0").slice(100.0, 120.0)
-    tunnel, params = Tunnel.from_plan(plan, n_candidates=n_candidates), lidar.LidarParams(fused=fused)
+    tunnel = dataclasses.replace(Tunnel.from_plan(plan), n_candidates=n_candidates)
+    params = lidar.LidarParams(fused=fused)
     poses = reference.random_poses(plan, 500, np.random.default_rng(1))
     scan = jax.jit(jax.vmap(partial(lidar.scan, params=params), (None, 0, 0, 0)))
     ranges = np.asarray(scan(tunnel, poses.position, poses.heading, poses.station))

@@ -53,9 +53,11 @@ def test_scans_are_those_of_xla(plan, lining):
     check_same(plan, lining)
 
 
-def test_blocks_of_many_segments_and_windows_of_few_blocks_are_those_of_xla(plan_of):
+def test_blocks_of_many_segments_and_windows_of_few_blocks_are_those_of_xla(plan_of, monkeypatch):
     plan = plan_of(tunnels.tunnel_arrays(tunnels.straight(12.0), roughness=0.015, correlation=0.1))
-    tunnel, poses = Tunnel.from_plan(plan, "smooth", block_length=8.0, max_segments=50), poses_in(plan, 300)
+    monkeypatch.setattr("subterra_jax.tunnel.tunnel.BLOCK_LENGTH", 8.0)
+    monkeypatch.setattr("subterra_jax.tunnel.tunnel.MOST_SEGMENTS", 50)
+    tunnel, poses = Tunnel.from_plan(plan, "smooth"), poses_in(plan, 300)
     assert tunnel.wall.shape[2] > 17
     assert tunnel.n_scan < 16
     np.testing.assert_allclose(scans(tunnel, poses, by_kernel), scans(tunnel, poses, by_xla), atol=1e-4)

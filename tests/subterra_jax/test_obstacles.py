@@ -1,7 +1,5 @@
 """Boxes on the way: where they may stand, and rays and distances against known answers."""
 
-from types import SimpleNamespace
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,8 +7,9 @@ import pytest
 
 import subterra_jax as st
 from benchmarks import reference
-from subterra_jax.parts import hashing, obstacles
+from subterra_jax.parts import obstacles
 from subterra_jax.parts.obstacles import Boxes, distance_along
+from subterra_jax.parts.slip import uniform_at
 from subterra_jax.tunnel import Tunnel
 
 PARAMS = jax.tree.map(jnp.float32, obstacles.ObstacleParams())
@@ -97,7 +96,10 @@ def test_the_clearance_is_the_distance_to_the_nearest_side(tunnel):
     boxes = jax.jit(obstacles.boxes_in)(jnp.uint32(5), slots, tunnel, PARAMS)
     sides = np.asarray(segments(boxes), np.float64).reshape(-1, 4)
     plan, compared = st.load_tunnel("subterra-351"), 0
-    own, params = obstacles.ObstacleState(jnp.uint32(5), 0.0), SimpleNamespace(obstacles=PARAMS)
+    own, params = (
+        obstacles.ObstacleState(jnp.uint32(5), jnp.float32(0.0)),
+        st.make("Subterra/Obstructed-v1", "control")[1],
+    )
     clearance = jax.jit(lambda at, station: obstacles.Obstacles().clearance(own, at, station, tunnel, params))
     for node in range(40, 1000, 9):
         position = plan.centre[node].astype(np.float32)
@@ -118,8 +120,8 @@ def test_two_episodes_have_different_boxes_and_one_always_the_same(tunnel):
 
 
 def test_numbers_of_places_are_uniform_and_independent():
-    u = np.asarray(hashing.uniform(jnp.uint32(7), jnp.arange(20_000), 0), np.float64)
-    v = np.asarray(hashing.uniform(jnp.uint32(7), jnp.arange(20_000), 1), np.float64)
+    u = np.asarray(uniform_at(jnp.uint32(7), jnp.arange(20_000), 0), np.float64)
+    v = np.asarray(uniform_at(jnp.uint32(7), jnp.arange(20_000), 1), np.float64)
     counts = np.histogram(u, 20, (0.0, 1.0))[0]
     assert np.sum((counts - 1000.0) ** 2 / 1000.0) < 43.8  # chi² of 19 degrees of freedom, 0.1 %
     assert abs(np.corrcoef(u, v)[0, 1]) < 3 / np.sqrt(20_000)

@@ -1,7 +1,5 @@
 """Odometer and slip: the truth where nothing drifts, and errors with draws of their own; `net` has their sizes."""
 
-from types import SimpleNamespace
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,8 +7,8 @@ import pytest
 
 import subterra_jax as st
 from subterra_jax.parts import odometer as odometry
-from subterra_jax.parts import slip, wander
-from subterra_jax.parts.wander import WanderParams
+from subterra_jax.parts import slip
+from subterra_jax.parts.slip import WanderParams
 
 TASK = "Subterra/TraverseShort-v1"
 N, T = 20_000, 50
@@ -30,7 +28,9 @@ def test_without_errors_the_observed_odometry_is_the_path_driven():
 
 def begun(part, noise, **params):
     """State of a part at the start of an episode, from its draw."""
-    return part.begin(noise, None, SimpleNamespace(**params))
+    env, made = st.make("Subterra/StopAtShort-v1", tunnel="control")
+    state = jax.eval_shape(env.reset, jax.random.key(0), made)[1]
+    return part.begin(noise, state, made.replace(**params))
 
 
 def test_every_error_of_an_episode_has_a_draw_of_its_own():
@@ -60,7 +60,7 @@ def test_dead_reckoned_headings_stay_within_half_a_turn():
 def test_a_wandering_error_keeps_its_spread_and_loses_its_memory_over_its_length():
     first, *later = jax.random.normal(jax.random.key(0), (151, N))
     value = start = PARAMS.sigma * first
-    advance = jax.jit(jax.vmap(wander.advance_wander, (0, None, 0, None)))
+    advance = jax.jit(jax.vmap(slip.advance_wander, (0, None, 0, None)))
     for noise in later:
         value = advance(value, jnp.float32(0.2), noise, PARAMS)
     start, value = np.asarray(start, np.float64), np.asarray(value, np.float64)
@@ -72,13 +72,13 @@ def test_a_wandering_error_keeps_its_spread_and_loses_its_memory_over_its_length
 
 
 def test_the_size_of_the_steps_does_not_matter_to_a_wandering_error():
-    one = wander.advance_wander(jnp.float32(0.02), jnp.float32(30.0), jnp.float32(0.0), PARAMS)
+    one = slip.advance_wander(jnp.float32(0.02), jnp.float32(30.0), jnp.float32(0.0), PARAMS)
     np.testing.assert_allclose(one, 0.02 * np.exp(-1.0), rtol=1e-5)
     many = jnp.float32(0.02)
     for _ in range(10):
-        many = wander.advance_wander(many, jnp.float32(-3.0), jnp.float32(0.0), PARAMS)
+        many = slip.advance_wander(many, jnp.float32(-3.0), jnp.float32(0.0), PARAMS)
     np.testing.assert_allclose(many, one, rtol=1e-5)
-    assert wander.advance_wander(jnp.float32(0.02), jnp.float32(0.0), jnp.float32(5.0), PARAMS) == jnp.float32(0.02)
+    assert slip.advance_wander(jnp.float32(0.02), jnp.float32(0.0), jnp.float32(5.0), PARAMS) == jnp.float32(0.02)
 
 
 def test_slips_have_the_stated_spread_and_each_a_draw_of_its_own():

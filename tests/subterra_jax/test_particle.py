@@ -18,7 +18,7 @@ from subterra_jax.baselines.registry import make_agent
 from subterra_jax.baselines.scanmodel import TunnelPose
 from subterra_jax.baselines.wallmap import wall_map
 from subterra_jax.evaluation import evaluate, listed_episodes
-from subterra_jax.parts.wander import WanderParams
+from subterra_jax.parts.slip import WanderParams
 from tests.subterra_jax import tunnels
 
 move, resample = jax.jit(particle_cloud.move), jax.jit(particle_cloud.resample)

@@ -318,7 +318,7 @@ def test_a_new_kind_of_network_is_one_class_and_one_row(world, monkeypatch):
     layout = {"action_low": (0.0, -1.5), "action_high": (2.0, 1.5)}
     agent = policies.from_tensors("constant", layout, {"command": np.array([1.0, 0.25])}, "one")
     env, params = st.make(DRIVEN)
-    assert policies.with_map(agent, params) is agent
+    assert agent.with_map(params) is agent
     policies.check_fits(agent, env, params, "one")
     policy = load_policy(agent, env, params)
     action, _ = policy(jnp.zeros(env.observation_size(params)), policy.initial_memory())

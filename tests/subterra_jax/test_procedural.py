@@ -105,8 +105,9 @@ def test_where_no_tunnel_is_named_it_is_the_open_worlds_and_the_papers_for_the_p
         st.make("Subterra/StopAt-v1", split="test")
     with pytest.raises(ValueError, match="either a tunnel or a split, got both 'control' and 'val'"):
         st.make("Subterra/StopAt-v1", "control", split="val")
-    with pytest.raises(ValueError, match="B2Walk-v1 happens in one tunnel"):
-        st.make("Subterra/B2Walk-v1", split="val")
+    for choice in ({"split": "val"}, {"tunnel": ["subterra-351", "metro"]}):
+        with pytest.raises(ValueError, match="B2Walk-v1 happens in one tunnel"):
+            st.make("Subterra/B2Walk-v1", **choice)
 
 
 def afresh(name="open:cast:val:5", length=60.0) -> st.Tunnel:

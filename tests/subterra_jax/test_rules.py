@@ -7,8 +7,7 @@ import pytest
 
 import subterra_jax as st
 from subterra_jax.parts.odometer import OdometryParams
-from subterra_jax.parts.slip import SlipParams
-from subterra_jax.parts.wander import WanderParams
+from subterra_jax.parts.slip import SlipParams, WanderParams
 from subterra_jax.rules import GoalParams, RewardParams, StartParams
 
 EXACT = {

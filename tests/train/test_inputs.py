@@ -152,7 +152,7 @@ def test_a_filter_on_the_map_reports_what_it_believes_in_training_as_in_driving(
     env, params, driver = world.env, world.params, learner.driver
     assert (driver.layout.shape.n_action, env.action_size) == (2, 5)
     policy = Policy(driver.init(jax.random.PRNGKey(0)))
-    agent = policies.with_map(make_agent(driver, policy), params)
+    agent = make_agent(driver, policy).with_map(params)
     policies.check_fits(agent, env, params, "mine")
 
     @jax.jit
