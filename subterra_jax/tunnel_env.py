@@ -276,7 +276,7 @@ class TunnelEnv:
         return params
 
     def boxes(self, state: State, params: EnvParams) -> list[Any]:
-        """Return the boxes near the robot, for pictures: a list of `parts.obstacles.Boxes`."""
+        """Return the boxes near the robot, for pictures: a list of `parts.part.Boxes`."""
         tunnel = params.tunnel.pick(state.tunnel)
         return [b for part in self.parts for b in part.boxes(state.parts[part.name], state.station, tunnel, params)]
 

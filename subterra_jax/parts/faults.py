@@ -14,8 +14,7 @@ from jaxtyping import Array, Bool, Float, UInt32
 
 from subterra_jax import constants
 from subterra_jax.parts.odometer import OdometryState
-from subterra_jax.parts.part import Batch, Drive, Keys, Noise, Part, SensingState, Step
-from subterra_jax.parts.slip import uniform_at
+from subterra_jax.parts.part import Batch, Drive, Keys, Noise, Part, SensingState, Step, uniform_at
 from subterra_jax.parts.unicycle import wrap
 from subterra_jax.state import EnvParams, State
 

@@ -9,8 +9,7 @@ from flax import struct
 from jaxtyping import Array, Float, Int, UInt32
 
 from subterra_jax import constants
-from subterra_jax.parts.part import Batch, Keys, Part, SensingState
-from subterra_jax.parts.slip import uniform_at
+from subterra_jax.parts.part import Batch, Boxes, Keys, Part, SensingState, uniform_at
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel import Tunnel, at_station
 
@@ -39,15 +38,6 @@ class ObstacleParams:
     first: float = constants.BOX_FIRST
     trolley_length: float = constants.TROLLEY_LENGTH
     trolley_width: float = constants.TROLLEY_WIDTH
-
-
-@struct.dataclass
-class Boxes:
-    """A few boxes in the tunnel frame."""
-
-    centre: Float[Array, "n 2"]  # middles, m; far away where there is none
-    axis: Float[Array, "n 2"]  # unit vectors along the first side
-    half: Float[Array, "n 2"]  # half sides, m, the first along `axis`
 
 
 def distance_along(

@@ -13,12 +13,12 @@ import zlib
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
+import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt32
 
 if TYPE_CHECKING:
-    from subterra_jax.parts.obstacles import Boxes
     from subterra_jax.state import EnvParams, State
     from subterra_jax.tunnel import Foot, Tunnel
 
@@ -119,6 +119,15 @@ class SensingState:
     needed: Any = True
     hits: Callable[[Array], Any] = lambda directions: np.inf
     corrupt: Callable[[Array], Array] = lambda ranges: ranges
+
+
+@struct.dataclass
+class Boxes:
+    """A few boxes in the tunnel frame."""
+
+    centre: Float[Array, "n 2"]  # middles, m; far away where there is none
+    axis: Float[Array, "n 2"]  # unit vectors along the first side
+    half: Float[Array, "n 2"]  # half sides, m, the first along `axis`
 
 
 class Part(abc.ABC):
@@ -265,3 +274,24 @@ class Motion(Part):
         Args:
             drive: The clipped command as the other parts have changed it.
         """
+
+
+def uniform_at(seed: UInt32[Array, ""], slot: Int[Array, "*n"], index: int) -> Float[Array, "*n"]:
+    """Return uniform numbers in [0, 1) of places: equal for equal seed and slot, and never stored.
+
+    Args:
+        seed: Seed of the episode.
+        slot: Places.
+        index: Number of the draw at a place; any small constant.
+
+    Source: the finaliser of MurmurHash3 (Appleby), twice, because slots are consecutive.
+    """
+    mixed = slot.astype(jnp.uint32) * jnp.uint32(0x9E3779B1) + jnp.uint32((index * 0x85EBCA77 + 1) & 0xFFFFFFFF)
+    mixed = _finish(_finish(mixed) ^ seed)
+    return (mixed >> 8).astype(jnp.float32) * jnp.float32(2.0**-24)
+
+
+def _finish(bits: UInt32[Array, "*n"]) -> UInt32[Array, "*n"]:
+    bits = (bits ^ (bits >> 16)) * jnp.uint32(0x85EBCA6B)
+    bits = (bits ^ (bits >> 13)) * jnp.uint32(0xC2B2AE35)
+    return bits ^ (bits >> 16)

@@ -1,4 +1,4 @@
-"""Slip between the command and the true motion; errors that wander over the distance, and random numbers of a place."""
+"""Slip between the command and the true motion, and the error that wanders over the distance, also of the odometer."""
 
 import dataclasses
 from typing import Any, ClassVar
@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float, Int, UInt32
+from jaxtyping import Array, Float
 
 from subterra_jax import constants
 from subterra_jax.parts.part import Batch, Drive, Keys, Noise, Part, Step
@@ -106,24 +106,3 @@ class Slip(Part):
     def privileged(self, own: SlipState) -> dict[str, Array]:
         """Return the slip of the speed (1) and of the yaw rate (rad/s)."""
         return {"slip": own.gain + own.wander, "yaw_slip": own.yaw}
-
-
-def uniform_at(seed: UInt32[Array, ""], slot: Int[Array, "*n"], index: int) -> Float[Array, "*n"]:
-    """Return uniform numbers in [0, 1) of places: equal for equal seed and slot, and never stored.
-
-    Args:
-        seed: Seed of the episode.
-        slot: Places.
-        index: Number of the draw at a place; any small constant.
-
-    Source: the finaliser of MurmurHash3 (Appleby), twice, because slots are consecutive.
-    """
-    mixed = slot.astype(jnp.uint32) * jnp.uint32(0x9E3779B1) + jnp.uint32((index * 0x85EBCA77 + 1) & 0xFFFFFFFF)
-    mixed = _finish(_finish(mixed) ^ seed)
-    return (mixed >> 8).astype(jnp.float32) * jnp.float32(2.0**-24)
-
-
-def _finish(bits: UInt32[Array, "*n"]) -> UInt32[Array, "*n"]:
-    bits = (bits ^ (bits >> 16)) * jnp.uint32(0x85EBCA6B)
-    bits = (bits ^ (bits >> 13)) * jnp.uint32(0xC2B2AE35)
-    return bits ^ (bits >> 16)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from subterra_jax.parts.obstacles import Boxes
+from subterra_jax.parts.part import Boxes
 from subterra_jax.tunnel import Tunnel
 
 BACKGROUND = (250, 250, 248)

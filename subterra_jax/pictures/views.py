@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from subterra_jax.lidar3d.beams import level_ring
-from subterra_jax.parts.obstacles import Boxes
+from subterra_jax.parts.part import Boxes
 from subterra_jax.parts.spatial_lidar import SENSORS
 from subterra_jax.pictures.camera import FollowCamera, TunnelChoice
 from subterra_jax.pictures.stage import add_carrier

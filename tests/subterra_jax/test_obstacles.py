@@ -9,7 +9,7 @@ import subterra_jax as st
 from benchmarks import reference
 from subterra_jax.parts import obstacles
 from subterra_jax.parts.obstacles import Boxes, distance_along
-from subterra_jax.parts.slip import uniform_at
+from subterra_jax.parts.part import uniform_at
 from subterra_jax.tunnel import Tunnel
 
 PARAMS = jax.tree.map(jnp.float32, obstacles.ObstacleParams())

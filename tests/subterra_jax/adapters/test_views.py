@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from subterra_jax.parts.obstacles import Boxes
+from subterra_jax.parts.part import Boxes
 from subterra_jax.pictures import top_down as drawing
 from subterra_jax.pictures.views import make_view
 
