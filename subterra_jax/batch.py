@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from subterra_jax.compiled import compiled, hashable
 from subterra_jax.env import Env, Info
+from subterra_jax.rows import for_some
 
 # Those of a `TunnelEnv`, or of another `Env`: the walking robot's, say.
 EnvParams: TypeAlias = Any
@@ -109,8 +110,8 @@ class AutoReset:
     ) -> tuple[Obs, Obs]:
         """Observations after and before any reset.
 
-        The fused kernels take all scans in one go and skip those that nobody wants, of environments that have not
-        finished.
+        Of those before, only finished environments are cast again. The fused kernels take all scans in one go and skip
+        those that nobody wants.
         """
         if self.env.skips_unneeded(params):
             twice = lambda one, other: jnp.concatenate([one, other])  # noqa: E731
@@ -121,32 +122,11 @@ class AutoReset:
             obs, final = jnp.split(observe(both_states, both_noises, both_params, needed), 2)
             return obs, jnp.where(done[:, None], final, obs)
         obs = self._vmap(self.env.observe, 2)(merged, noise, params)
-        return obs, self._final(done, stepped, noise, params, obs)
 
-    def _final(self, done: Bool[Array, "n_envs"], stepped: State, noise: StepNoise, params: EnvParams, obs: Obs) -> Obs:
-        """Observations of the states before any reset.
+        def again(pick: Callable[[Any], Any]) -> Obs:
+            return self._vmap(self.env.observe, 2)(pick(stepped), pick(noise), self._of_batched(params, pick))
 
-        Only finished environments are cast again: a few at a time in the usual step, and everybody in the rare step in
-        which more have finished.
-        """
-        n_envs = done.shape[0]
-        n_few = max(1, n_envs // 32)
-
-        def few() -> Obs:
-            (index,) = jnp.nonzero(done, size=n_few, fill_value=n_envs)
-            rows = lambda tree: jax.tree.map(lambda leaf: jnp.take(leaf, index, axis=0, mode="clip"), tree)  # noqa: E731
-            some = self._of_batched(params, rows)
-            return obs.at[index].set(self._vmap(self.env.observe, 2)(rows(stepped), rows(noise), some), mode="drop")
-
-        def everybody() -> Obs:
-            again = self._vmap(self.env.observe, 2)(stepped, noise, params)
-            return jnp.where(done[:, None], again, obs)
-
-        n_done = jnp.sum(done)
-        if self.axes:
-            n_done = jax.lax.pmax(n_done, self.axes)
-        branch = jnp.where(n_done == 0, 0, jnp.where(n_done <= n_few, 1, 2))
-        return jax.lax.switch(branch, [lambda: obs, few, everybody])
+        return obs, for_some(done, again, obs, self.axes)
 
     def _of_batched(self, params: EnvParams, change: Callable[[Any], Any]) -> EnvParams:
         """Params with `change` applied to those that differ among environments; their batch axis is the first."""

@@ -106,3 +106,36 @@ def spread(row: tuple[Any, ...], batched: Any, axis_size: int) -> list[jax.Array
         jnp.asarray(part) if is_batched else jnp.broadcast_to(part, (axis_size, *jnp.shape(part)))
         for part, is_batched in zip(row, batched, strict=True)
     ]
+
+
+def for_some(
+    mask: jax.Array, function: Callable[[Callable[[Any], Any]], Any], others: Any, axes: tuple[str, ...] = ()
+) -> Any:
+    """Compute rows where a mask says so, and take the others as they are.
+
+    Few are marked in the usual step: then a 32nd of the rows is computed, and all of them in the rare one with more.
+
+    Args:
+        mask: Rows to compute, `(n,)`.
+        function: Computes rows; it gets a function that takes those to be computed out of any pytree `(n, ...)`.
+        others: All rows as they are.
+        axes: Axes along which batches are vmapped themselves; they then agree on what is computed.
+    """
+    n = mask.shape[0]
+    n_few = max(1, n // 32)
+
+    def few() -> Any:
+        (index,) = jnp.nonzero(mask, size=n_few, fill_value=n)
+        some = function(lambda tree: jax.tree.map(lambda leaf: leaf.at[index].get(mode="clip"), tree))
+        return jax.tree.map(lambda old, new: old.at[index].set(new, mode="drop"), others, some)
+
+    def everybody() -> Any:
+        pick = lambda old, new: jnp.where(mask.reshape(-1, *[1] * (old.ndim - 1)), new, old)  # noqa: E731
+        return jax.tree.map(pick, others, function(lambda tree: tree))
+
+    n_marked = jnp.sum(mask)
+    if axes:
+        n_marked = jax.lax.pmax(n_marked, axes)
+    return jax.lax.switch(
+        jnp.where(n_marked == 0, 0, jnp.where(n_marked <= n_few, 1, 2)), [lambda: others, few, everybody]
+    )

@@ -16,7 +16,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from subterra_jax.lidar.nvidia import load_words, most, reciprocal
+from subterra_jax.lidar.kernels import load_words, most, reciprocal
 from subterra_jax.tunnel import CONTACT_REACH, Tunnel
 from subterra_jax.tunnel.packed import BLOCK_WORDS, PAIR_WORDS, unpack
 

@@ -12,7 +12,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from subterra_jax import constants
-from subterra_jax.lidar import cast, gpu, kernels, nvidia
+from subterra_jax.lidar import cast, gpu, kernels
 from subterra_jax.rows import rowwise, slope_along, vary_like
 from subterra_jax.tunnel import Tunnel, node_at
 
@@ -69,7 +69,7 @@ def scan(
 
 def skips_unneeded(params: LidarParams) -> bool:
     """Tell whether the fused kernels cast a batch of scans; they cost little for scans that nobody wants."""
-    return params.fused and nvidia.present()
+    return params.fused and kernels.on_nvidia()
 
 
 def _cast(

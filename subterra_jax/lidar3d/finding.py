@@ -8,7 +8,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from subterra_jax.compiled import in_32_bits
-from subterra_jax.lidar import nvidia
+from subterra_jax.lidar import kernels
 from subterra_jax.lidar.kernels import compiled_by_numba, fastest
 from subterra_jax.lidar3d import fused
 from subterra_jax.lidar3d.march import march
@@ -96,7 +96,7 @@ def _image(relief: Relief, origin: Array, directions: Array, block: Array, limit
 def _images(relief: Relief, origins: Array, directions: Array, blocks: Array, limits: Array) -> tuple[Hits, Point]:
     """Find what the rays of many scans meet."""
     apart = jax.vmap(_image, (None, 0, 0, 0, 0))
-    if not nvidia.present() or directions.shape[1] * directions.shape[2] % fused.ROWS:
+    if not kernels.on_nvidia() or directions.shape[1] * directions.shape[2] % fused.ROWS:
         return apart(relief, origins, directions, blocks, limits)
     rows = origins, directions, blocks, limits
     return fastest(apart, fused.find, apart)(relief, *rows)

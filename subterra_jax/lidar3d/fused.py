@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from subterra_jax.lidar.nvidia import fma, load_words, reciprocal
+from subterra_jax.lidar.kernels import fma, load_words, reciprocal
 from subterra_jax.lidar3d.march import march
 from subterra_jax.lidar3d.meeting import Hits, Point, Tools, normals
 from subterra_jax.lidar3d.relief import ARRAYS, Relief

@@ -17,6 +17,7 @@ from subterra_jax.parts.spatial_lidar import SENSORS
 from subterra_jax.policies.files import GAIT, PolicyError, read_facts
 from subterra_jax.policies.loading import load
 from subterra_jax.policies.opening import open_agent, policy_source, require_known
+from subterra_jax.rows import for_some
 from subterra_jax.state import EnvParams
 from subterra_jax.tasks import make
 from subterra_jax.tunnel_env import TunnelEnv
@@ -171,29 +172,10 @@ def _begin_where_new(driver: DrivingPolicy, obs: Array, memory: DrivingMemory, s
         here, view = _situation(driver, obs, state)
         return _as(_begin(driver, memory.key, view, here), memory.agent)
 
-    def keep(obs: Array, memory: DrivingMemory, state: Any) -> Any:
-        return memory.agent
-
     new, robots = memory.steps == 0, (obs, memory, state)
     if obs.ndim == 1:
-        return jax.lax.cond(new, begin, keep, *robots)
-    n = obs.shape[0]
-    n_few = max(1, n // 32)
-
-    def few(*robots: Any) -> Any:
-        (index,) = jnp.nonzero(new, size=n_few, fill_value=n)
-        begun = jax.vmap(begin)(*jax.tree.map(lambda leaf: leaf.at[index].get(mode="clip"), robots))
-        return jax.tree.map(lambda old, some: old.at[index].set(some, mode="drop"), memory.agent, begun)
-
-    def everybody(*robots: Any) -> Any:
-        begun = jax.vmap(begin)(*robots)
-        return jax.tree.map(
-            lambda some, old: jnp.where(new.reshape(-1, *[1] * (old.ndim - 1)), some, old), begun, memory.agent
-        )
-
-    n_new = jnp.sum(new)
-    branch = jnp.where(n_new == 0, 0, jnp.where(n_new <= n_few, 1, 2))
-    return jax.lax.switch(branch, [keep, few, everybody], *robots)
+        return jax.lax.cond(new, begin, lambda obs, memory, state: memory.agent, *robots)
+    return for_some(new, lambda pick: jax.vmap(begin)(*pick(robots)), memory.agent)
 
 
 def load_policy(source: Any, env: TunnelEnv | None = None, params: EnvParams | None = None) -> Policy:

@@ -11,7 +11,7 @@ import pytest
 import subterra_jax as st
 from benchmarks import reference
 from subterra_jax import lidar
-from subterra_jax.lidar import gpu, nvidia
+from subterra_jax.lidar import gpu, kernels
 from subterra_jax.parts import unicycle
 from subterra_jax.tunnel import CONTACT_REACH, Tunnel, node_at, packed
 from tests.subterra_jax.lowering import for_nvidia
@@ -97,7 +97,7 @@ def test_needed_scans_do_not_depend_on_the_unneeded_ones(plan: st.TunnelPlan) ->
 def test_a_tunnel_whose_walls_were_replaced_is_cast_by_xla(
     plan: st.TunnelPlan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(nvidia, "present", lambda: True)
+    monkeypatch.setattr(kernels, "on_nvidia", lambda: True)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     tunnel, rows = Tunnel.from_plan(plan), (jnp.zeros((32, 2)), jnp.zeros(32), jnp.zeros(32))
     scan = jax.vmap(lambda tunnel, *row: lidar.scan(tunnel, *row, lidar.LidarParams()), (None, 0, 0, 0))
@@ -191,7 +191,7 @@ def test_a_batch_of_robots_uses_the_kernel_where_there_is_an_nvidia_gpu(
     plan: st.TunnelPlan, bits: int, there: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    monkeypatch.setattr(nvidia, "present", lambda: there)
+    monkeypatch.setattr(kernels, "on_nvidia", lambda: there)
     one = jnp.zeros((32, 2), jnp.float32), jnp.zeros(32, jnp.float32)
     tunnel = Tunnel.from_plan(plan)
     measure = jax.vmap(unicycle.clearance, (None, 0, 0))
@@ -207,7 +207,7 @@ def test_a_step_of_a_batch_launches_two_kernels_of_ours_and_draws_in_two_calls(m
     env, params = st.make("Subterra/Faulted-v1", tunnel="control")
     state = jax.eval_shape(lambda key: st.AutoReset(env).reset(key, params, 32)[1], jax.random.key(0))
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    monkeypatch.setattr(nvidia, "present", lambda: True)
+    monkeypatch.setattr(kernels, "on_nvidia", lambda: True)
     text = for_nvidia(st.AutoReset(env).step, jax.random.key(0), state, jnp.zeros((32, 2)), params)
     assert text.count("triton") == 2
     draws = jax.make_jaxpr(lambda key: env.draw_step(key, (32,), params))(jax.random.key(0))

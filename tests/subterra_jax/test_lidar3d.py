@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import subterra_jax as st
 from subterra_jax import lidar3d, native
-from subterra_jax.lidar import nvidia
+from subterra_jax.lidar import kernels
 from subterra_jax.lidar3d import beams, casting, finding, fused
 from subterra_jax.lidar3d.relief import ARRAYS, Relief
 from subterra_jax.lidar3d.surface import BOX_CORNERS, BOX_FACES, Axis, Triangles
@@ -193,7 +193,7 @@ def test_scans_of_one_place_meet_what_rays_of_a_place_each_meet(reliefs):
 
 def test_the_kernel_for_scans_lowers_for_a_gpu_and_serves_a_batch(reliefs, monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    monkeypatch.setattr(nvidia, "present", lambda: True)
+    monkeypatch.setattr(kernels, "on_nvidia", lambda: True)
 
     def ranges(relief, origin, way, station):
         meet = jax.vmap(casting.meet, (None, 0, None, 0, None))
