@@ -1,6 +1,6 @@
 """Beam directions of common LiDARs: unit vectors in the sensor's frame, x ahead, y to the left, z upwards.
 
-They are the input of `lidar3d.scan`, which takes a sweep from one pose; motion during a sweep is left to the caller.
+They are, turned into the tunnel frame, the input of `lidar3d.meet`.
 """
 
 from typing import Any

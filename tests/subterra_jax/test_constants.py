@@ -14,7 +14,7 @@ import pytest
 import subterra_jax as st
 from subterra_jax import tasks
 from subterra_jax.host.task_ids import PLANAR
-from subterra_jax.params import task_figures
+from subterra_jax.params import digest, plain, task_figures
 from subterra_jax.procedural import open_world
 from subterra_jax.rules import StartParams
 
@@ -53,10 +53,10 @@ def test_the_digest_of_a_task_is_the_one_that_results_are_comparable_under(id):
 def test_a_walking_task_has_its_numbers_whatever_its_policy(id):
     _, params = st.make(id)
     leaves = jax.tree_util.tree_flatten_with_path(params)[0]
-    named = {jax.tree_util.keystr(path, simple=True, separator="."): digest.plain(leaf) for path, leaf in leaves}
+    named = {jax.tree_util.keystr(path, simple=True, separator="."): plain(leaf) for path, leaf in leaves}
     numbers = {name: value for name, value in named.items() if not re.search(r"\b(tunnel|track|tensors)\.", name)}
     numbers["beams"] = params.lidar.n_beams if id.endswith("Traverse-v1") else None
-    assert digest.digest(numbers)[:16] == WALKING[id], numbers
+    assert digest(numbers)[:16] == WALKING[id], numbers
 
 
 def test_a_renamed_field_keeps_its_key(monkeypatch):
