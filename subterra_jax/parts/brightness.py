@@ -4,6 +4,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from subterra_jax import constants
@@ -46,6 +47,19 @@ def wall_brightness(
         above = ends[:, 2] - ground[:, 0] - ground[:, 1] * ahead
     at = tunnel.spacing * (node - tunnel.first_node).astype(ahead.dtype) + ahead
     return brightness(jnp, at, wall_angle(jnp, left, above), tunnel.texture, texture), tangent
+
+
+def normal_beside(normal: Float[Array, "n"], channel: int) -> Float[Array, "n"]:
+    """Return nearly normal numbers for a further channel, uncorrelated with the first: drawing them costs more.
+
+    They are sums of four hashed bytes, at most 3.5.
+    """
+    h: Any = jax.lax.bitcast_convert_type(normal, jnp.uint32) ^ np.uint32(channel)
+    for shift, factor in ((16, 0x7FEB352D), (15, 0x846CA68B)):
+        h = (h ^ (h >> np.uint32(shift))) * np.uint32(factor)
+    even = (h & np.uint32(0x00FF00FF)) + ((h >> np.uint32(8)) & np.uint32(0x00FF00FF))
+    total = (even & np.uint32(0xFFFF)) + (even >> np.uint32(16))
+    return (total.astype(jnp.float32) - 510.0) * np.float32((12.0 / (4.0 * (256.0**2 - 1.0))) ** 0.5)
 
 
 def intensity(

@@ -9,7 +9,7 @@ from jaxtyping import Array
 
 from subterra_jax import lidar
 from subterra_jax.lidar3d import echo
-from subterra_jax.parts.brightness import MOST, intensity, wall_brightness
+from subterra_jax.parts.brightness import MOST, intensity, normal_beside, wall_brightness
 from subterra_jax.parts.part import Bounds, Noise, Part, SensingState
 from subterra_jax.state import EnvParams
 
@@ -25,14 +25,14 @@ class PlanarLidar(Part):
         return {"lidar": lidar.LidarParams()}
 
     def normals(self, params: EnvParams) -> int:
-        return params.lidar.n_beams * (1 + params.lidar.intensity)
+        return params.lidar.n_beams
 
     def observe(self, own: Any, sensing: SensingState, noise: Noise, params: EnvParams) -> dict[str, Array]:
         walls, n = self.true_ranges(own, sensing, params), params.lidar.n_beams
         directions = lidar.beam_directions(sensing.heading, n)
         things = sensing.hits(directions)
         ranges = sensing.corrupt(jnp.minimum(walls, things))
-        entries = {"ranges": lidar.add_noise(ranges, noise.normal[:n], params.lidar)}
+        entries = {"ranges": lidar.add_noise(ranges, noise.normal, params.lidar)}
         if params.lidar.intensity:
             ends = sensing.position + walls[:, None] * directions
             factor, tangent = wall_brightness(
@@ -41,7 +41,7 @@ class PlanarLidar(Part):
             slant = jnp.abs(tangent[:, 0] * directions[:, 1] - tangent[:, 1] * directions[:, 0])
             met = things < walls
             reflectivity = jnp.where(met, echo.ALBEDO_THING, echo.ALBEDO_LINING * factor)
-            shown = intensity(jnp.where(met, 1.0, slant), reflectivity, noise.normal[n:])
+            shown = intensity(jnp.where(met, 1.0, slant), reflectivity, normal_beside(noise.normal, 1))
             entries["intensity"] = jnp.where(ranges < params.lidar.range_max, shown, 0.0)
         return entries
 

@@ -14,7 +14,15 @@ from subterra_jax.lidar3d.casting import Met, meet, require_free, require_patter
 from subterra_jax.lidar3d.echo import EchoParams
 from subterra_jax.lidar3d.relief import Relief
 from subterra_jax.lidar3d.space import Mount, into_tunnel, stand
-from subterra_jax.parts.brightness import DOPPLER_MOST, DOPPLER_SIGMA, FULL_SCALE, MOST, intensity, wall_brightness
+from subterra_jax.parts.brightness import (
+    DOPPLER_MOST,
+    DOPPLER_SIGMA,
+    FULL_SCALE,
+    MOST,
+    intensity,
+    normal_beside,
+    wall_brightness,
+)
 from subterra_jax.parts.part import Bounds, Noise, Part, SensingState, Step
 from subterra_jax.parts.unicycle import wrap
 from subterra_jax.state import EnvParams, State
@@ -191,8 +199,7 @@ class SpatialLidar(Part):
         return {"lidar": make_sensor("spin16x64")}
 
     def normals(self, params: EnvParams) -> int:
-        """One for each beam and channel."""
-        return params.lidar.n_beams * (1 + params.lidar.intensity + params.lidar.doppler)
+        return params.lidar.n_beams
 
     def uniforms(self, params: EnvParams) -> int:
         """As many for each beam as its errors take."""
@@ -276,14 +283,14 @@ class SpatialLidar(Part):
             reflectivity = jnp.where(met.thing, reflectivity, reflectivity * factor)
         if uniform is not None and sensor.echo.losing:
             there &= echo.returns(ranges, cosine, reflectivity, uniform[:, 0], sensor.echo)
-        noisy = echo.add_noise(ranges, cosine, noise.normal[:n], sensor.echo)
+        noisy = echo.add_noise(ranges, cosine, noise.normal, sensor.echo)
         entries = {"scan": jnp.where(there, jnp.clip(noisy, 0.0, sensor.range_max), sensor.range_max)}
         if sensor.intensity:
-            shown = intensity(cosine, reflectivity, noise.normal[n : 2 * n], sensor.full_scale)
+            shown = intensity(cosine, reflectivity, normal_beside(noise.normal, 1), sensor.full_scale)
             entries["intensity"] = jnp.where(there, shown, 0.0)
         if sensor.doppler:
             closing = jnp.sum(rays * self._velocity(own, sensing, params), axis=-1)
-            speeds = DOPPLER_SIGMA * noise.normal[-n:] - closing
+            speeds = DOPPLER_SIGMA * normal_beside(noise.normal, 2) - closing
             entries["doppler"] = jnp.where(there, jnp.clip(speeds, -DOPPLER_MOST, DOPPLER_MOST), 0.0)
         return entries
 
