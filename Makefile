@@ -28,20 +28,11 @@ AGAIN := out/reproduce
 reproduce: $(STAMP)  ## speed, dirty clouds and cells of the board again, on a CPU in about 25 minutes; says what differs from the records
 	$(BIN)/python -m benchmarks.throughput --n 1 1024 --peers none --poses 200000 --out $(AGAIN)/speed
 	test ! -e $(SHARED)/data/dirty_clouds || $(BIN)/python -m benchmarks.dirty $(SHARED)/data/dirty_clouds --out $(AGAIN)/dirty
-	-$(BIN)/python -m benchmarks.board --again 20 --agents dead-reckoning fused scan-matching --out $(AGAIN)/board
+	$(BIN)/python -m benchmarks.board --tasks StopAt --start given --splits test-unseen --agents dead-reckoning fused --out $(AGAIN)/board
 	$(BIN)/python -m benchmarks.records compare $(AGAIN)/*/records.json
 
 arena: $(STAMP)    ## recordings for LiDAR-inertial programs into out/arena, 8 to 10 minutes and 2.2 GB; goes on where it stopped
 	$(BIN)/python -m benchmarks.slam arena --jobs 2 --out out/arena
-
-FIGURES := out/figures
-figures: $(STAMP)  ## the paper's figures at print size into out/figures, about 5 minutes on 2 cores
-	test -e $(FIGURES)/survey/truth.json || $(BIN)/python -m scene.survey --truth metro --length 60 --sensors avia os1 --scan-every 10 --out $(FIGURES)/survey
-	test -e $(FIGURES)/scene/manifest.json || $(BIN)/python -m scene.build $(FIGURES)/survey/survey.bag \
-		--trajectory $(FIGURES)/survey/groundtruth.tum --provenance simulated --out $(FIGURES)/scene
-	test -e $(FIGURES)/runs/seeds.json || $(BIN)/python -m train --task TraverseShort-v1 --seeds 0 1 2 3 4 --preset cpu \
-		--tunnel $(FIGURES)/scene/tunnel.npz --overwrite --out $(FIGURES)/runs
-	$(BIN)/python -m benchmarks.draw paper --survey $(FIGURES)/survey --scene $(FIGURES)/scene --runs $(FIGURES)/runs --out $(FIGURES)
 
 docs: $(STAMP)   ## the documentation into build/site, its tables checked against the records, warnings as errors
 	$(BIN)/python -m benchmarks.records check

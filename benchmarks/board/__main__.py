@@ -8,7 +8,6 @@ tables and picture of the cells that are there, or of those in `--cells`: `bench
 
 import json
 import sys
-from pathlib import Path
 
 from benchmarks.board import tables
 from benchmarks.board.cells import Cell, Cells, Score, keys_of, over_split, read_cells, setting_of
@@ -17,26 +16,20 @@ from benchmarks.board.drive import (
     BoardConfig,
     check,
     choose_by_rule,
-    compare,
     conditions_of_parts,
     drive,
     is_there,
     jobs_of,
 )
-from benchmarks.command import BenchmarkError, run_main
-from benchmarks.records import Record, measured, of_facts, write_records
-from benchmarks.results import environment_facts, png_bytes, write_file
+from benchmarks.command import run_main
+from benchmarks.records import Record, of_facts, write_records
+from benchmarks.results import png_bytes, write_file
 from subterra_jax.host.files import require_folder
 from subterra_jax.host.loading import load_file
 
-ON_RECORD = Path(__file__).parent / "cells.jsonl"
 
-
-def run(config: BoardConfig) -> int:
+def run(config: BoardConfig) -> None:
     """Drives the agents whose cells are missing, and writes tables, picture and records.
-
-    Returns:
-        1 where a cell driven again is another one, else 0.
 
     Raises:
         SubterraError: A task, split or agent is unknown, or the folder cannot be written.
@@ -44,8 +37,6 @@ def run(config: BoardConfig) -> int:
     for file in config.load:
         load_file(file)
     check(config)
-    if config.again:
-        return drive_again(config)
     jobs = jobs_of(config)
     require_folder(config.out)
     missing = [job for job in jobs if not is_there(config, job)]
@@ -59,36 +50,6 @@ def run(config: BoardConfig) -> int:
     if table := tables.screen_markdown(cells):
         print(table)
     print(config.out / "board.md")
-    return 0
-
-
-def drive_again(config: BoardConfig) -> int:
-    """Drives some episodes of cells on record, writes `again.json` and a record; returns 1 where a cell is another one.
-
-    Raises:
-        BenchmarkError: No cell of these tasks and agents is on record.
-    """
-    source = config.cells or ON_RECORD
-    settings, agents = {job.setting for job in jobs_of(config)}, config.agents
-    cells = [cell for cell in read_cells(source, conditions_of_parts(config))
-             if setting_of(cell) in settings and (not agents or cell["agent"] in agents)]  # fmt: skip
-    if not cells:
-        raise BenchmarkError(f"{source}: holds no cell of these tasks and agents")
-    require_folder(config.out)
-    found = []
-    for cell in cells:
-        row = compare(cell, config)
-        found.append(row)
-        print(
-            f"{row['task']}, {row['agent']}: {row['differ']} of {row['episodes']} differ", file=sys.stderr, flush=True
-        )
-        content = {"facts": environment_facts(), "cells": found}
-        write_file(config.out / "again.json", (json.dumps(content) + "\n").encode())
-    same = sum(not row["differ"] for row in found)
-    command, share = f"benchmarks.board --again {config.again} --out out/again", round(100.0 * same / len(found), 1)
-    write_records(config.out / "records.json", [measured("board/again/same", share, "%", command, n=len(found))])
-    print(f"{same} of {len(found)} cells have the same successes and contacts in {config.again} episodes")
-    return int(same < len(found))
 
 
 def records_of(cells: Cells) -> list[Record]:
@@ -117,7 +78,8 @@ def records_of(cells: Cells) -> list[Record]:
 
 def slug(setting: Setting) -> str:
     """Return the name of a task in ids."""
-    return _plain(setting.task) + ("+hidden" if setting.hidden_start else "")
+    texture = f"+texture-{setting.texture:g}" if setting.texture else ""
+    return _plain(setting.task) + ("+hidden" if setting.hidden_start else "") + texture
 
 
 def _plain(name: str) -> str:
@@ -128,6 +90,7 @@ def _plain(name: str) -> str:
 def _record(id: str, score: Score, cell: Cell, split: str) -> Record:
     share = lambda value: round(100.0 * value, 1)  # noqa: E731
     start = "hidden" if cell["hidden_start"] else "given"
+    words = f"--agents {cell['agent']} " + (f"--texture {cell['texture']:g} " if cell.get("texture") else "")
     return Record(
         id=id,
         value=share(score.success),
@@ -136,7 +99,7 @@ def _record(id: str, score: Score, cell: Cell, split: str) -> Record:
         n=score.n or None,
         split=split,
         seed=None,
-        command=f"benchmarks.board --tasks {cell['task']} --start {start} --agents {cell['agent']} --out out/board",
+        command=f"benchmarks.board --tasks {cell['task']} --start {start} {words}--out out/board",
         tolerance=share(score.high - score.low) / 2.0 if score.n else 0.1,
         **of_facts(cell["facts"]),
     )

@@ -68,7 +68,7 @@ def _place(cell: Cell) -> tuple[Any, ...]:
 
 def setting_of(cell: Cell) -> Setting:
     """Return what was driven."""
-    return Setting(cell["task"], cell["hidden_start"])
+    return Setting(cell["task"], cell["hidden_start"], cell.get("texture", 0.0))
 
 
 def settings_of(cells: Cells) -> list[Setting]:

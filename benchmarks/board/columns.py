@@ -26,15 +26,17 @@ class Column:
 
 @dataclasses.dataclass(frozen=True)
 class Setting:
-    """A task, and whether its start is hidden."""
+    """A task, whether its start is hidden, and how bright its walls are."""
 
     task: str  # A task of the benchmark without `Subterra/` and version, or the id of one's own
     hidden_start: bool = False  # Whether the start that is given is wrong by an unknown amount
+    texture: float = 0.0  # Dial of the walls' texture; above 0 agents get intensities
 
     @property
     def words(self) -> str:
         """Name for tables."""
-        return f"{self.task}, hidden start" if self.hidden_start else self.task
+        hidden = ", hidden start" if self.hidden_start else ""
+        return f"{self.task}{hidden}" + (f", texture {self.texture:g}" if self.texture else "")
 
 
 def columns_of(splits: Sequence[str], further: Sequence[str] = ()) -> tuple[Column, ...]:

@@ -14,12 +14,12 @@ import numpy as np
 from rich.console import Console
 
 import subterra_jax as st
-from benchmarks.board.cells import SCHEMA, Cell, setting_of
-from benchmarks.board.columns import FIRST, Column, Setting, columns_of, draw_episodes, tunnel_names
+from benchmarks.board.cells import SCHEMA
+from benchmarks.board.columns import FIRST, Setting, columns_of, draw_episodes, tunnel_names
 from benchmarks.board.roster import ROSTER, bare, entry_of, make_agent
 from benchmarks.command import BenchmarkError, require_least
 from benchmarks.results import environment_facts, write_file
-from subterra_jax.evaluation import Episodes, evaluate
+from subterra_jax.evaluation import evaluate
 from subterra_jax.evaluation.floor import floor
 from subterra_jax.evaluation.harness import fitting_batch
 from subterra_jax.parts.spatial_lidar import SENSORS
@@ -57,8 +57,7 @@ class BoardConfig:
     load: tuple[Path, ...] = ()  # Python files to run first, with things of one's own.
     memory: float = 8.0  # Memory for driving, GB; an agent that needs more drives in parts.
     report_only: bool = False  # Drive nothing.
-    cells: Path | None = None  # Cells to report or drive again.
-    again: int = 0  # Episodes of each cell to drive once more.
+    cells: Path | None = None  # Cells to report.
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,7 +67,6 @@ class Job:
     setting: Setting
     agent: str
     sensor: str
-    texture: float = 0.0
 
 
 def choose_by_rule() -> None:
@@ -86,15 +84,15 @@ def check(config: BoardConfig) -> None:
     """
     for agent in config.agents:
         require_known(bare(agent))
-    require_least(config, tunnels=1, episodes=2, again=0)
+    require_least(config, tunnels=1, episodes=2)
     if not columns_of(config.splits, config.further):
         raise BenchmarkError("there is nowhere to drive: name splits or further tunnels")
     if config.sensor not in SENSORS:
         raise BenchmarkError(f"no sensor {config.sensor!r}; there are {', '.join(SENSORS)}")
     if not config.memory > 0.0:
         raise BenchmarkError(f"memory must be above 0, got {config.memory}")
-    if config.cells is not None and not ((config.report_only or config.again) and config.cells.is_file()):
-        raise BenchmarkError(f"{config.cells}: --cells takes a file, with --report-only or --again")
+    if config.cells is not None and not (config.report_only and config.cells.is_file()):
+        raise BenchmarkError(f"{config.cells}: --cells takes a file, with --report-only")
 
 
 def jobs_of(config: BoardConfig) -> list[Job]:
@@ -114,7 +112,7 @@ def jobs_of(config: BoardConfig) -> list[Job]:
                 fits = (not entry.tasks or task in entry.tasks) and (entry.hidden or not hidden)
                 if asked or fits:
                     sensor = config.sensor if entry.group == "other" else entry.sensor
-                    found.append(Job(Setting(task, hidden), agent, sensor, config.texture))
+                    found.append(Job(Setting(task, hidden, config.texture), agent, sensor))
     return list(dict.fromkeys(found))
 
 
@@ -129,7 +127,8 @@ def enter(job: Job, tunnel: Any) -> tuple[Any, Any]:
     name = job.setting.task
     id = name if "/" in name else f"Subterra/{name}-v1"
     hidden: dict[str, Any] = {"hidden_start": True} if job.setting.hidden_start else {}
-    shown: dict[str, Any] = {"intensity": True, "texture": job.texture} if job.texture else {}
+    texture = job.setting.texture
+    shown: dict[str, Any] = {"intensity": True, "texture": texture} if texture else {}
     return st.make(id, tunnel=tunnel, estimates=True, sensor=job.sensor, **hidden, **shown)
 
 
@@ -223,39 +222,10 @@ def cell_of(config: BoardConfig, job: Job, env: Any, params: Any, floors: list[f
         "columns": [dataclasses.asdict(column) for column in columns],
         "tunnels": config.tunnels,
         "sensor": job.sensor,
+        "texture": job.setting.texture,
         "success": records.success.astype(int).tolist(),
         "contact": records.contact.astype(int).tolist(),
         "goal_error": [None if np.isnan(e) else round(float(e), 3) for e in records.goal_error],
         "floor": floors,
         "facts": {**environment_facts(), "constants_sha256": st.constants_digest()},
-    }
-
-
-def compare(cell: Cell, config: BoardConfig) -> dict[str, Any]:
-    """Drive some episodes of a cell again.
-
-    Returns:
-        Task, agent, in how many episodes success or contact is another, and the largest difference of the distance
-        from the goal, m; that is rounded to 1 mm in cells.
-    """
-    setting, columns = setting_of(cell), [Column(**column) for column in cell["columns"]]
-    rows = np.unique(np.linspace(0, len(cell["success"]) - 1, config.again).round().astype(int))
-    size = len(cell["success"]) // len(columns)
-    drawn = draw_episodes(setting, columns, cell["tunnels"], size, setting.task == "Faulted")
-    used = np.unique(drawn.tunnel[rows])  # the tunnels of these episodes alone are made
-    names = tunnel_names(columns, cell["tunnels"])
-    made = load([names[i] for i in used], sensor=cell["sensor"])
-    env, params = enter(Job(setting, cell["agent"], cell["sensor"]), made if len(made) > 1 else made[0])
-    some = {name: values[rows] for name, values in vars(drawn).items()}
-    episodes = Episodes(**{**some, "tunnel": np.searchsorted(used, some["tunnel"]).astype(np.int32)})
-    records = evaluate(env, params, make_agent(cell["agent"], env, params), episodes, len(rows))
-    then = {name: [cell[name][row] for row in rows] for name in ("success", "contact", "goal_error")}
-    differ = (records.success.astype(int) != then["success"]) | (records.contact.astype(int) != then["contact"])
-    apart = np.abs(records.goal_error - np.array([np.nan if e is None else e for e in then["goal_error"]]))
-    return {
-        "task": setting.words,
-        "agent": cell["agent"],
-        "differ": int(differ.sum()),
-        "episodes": len(rows),
-        "apart": float(np.nanmax(apart)) if np.isfinite(apart).any() else None,
     }

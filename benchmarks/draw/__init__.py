@@ -1,1 +1,1 @@
-"""Pictures: `kinds` of lining, a `scene`, the `paper`'s figures, a `film`."""
+"""Pictures: a `scene`, the `walls` of each kind, a `film`."""

@@ -1,6 +1,6 @@
-"""Draws a scene, walls, the paper's figures, or the film of an episode.
+"""Draws a scene, walls, or the film of an episode.
 
-`python -m benchmarks.draw scene build/tunnel --out view.png`; likewise `paper`, `film` and `walls`.
+`python -m benchmarks.draw scene build/tunnel --out view.png`; likewise `film` and `walls`.
 `--help` after one of them says more.
 """
 
@@ -9,7 +9,7 @@ from importlib import import_module
 
 from subterra_jax.pictures.renderer import choose_gl
 
-COMMANDS = ("scene", "paper", "film", "walls")
+COMMANDS = ("scene", "film", "walls")
 
 
 def main(words: list[str] | None = None) -> int:

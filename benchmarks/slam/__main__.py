@@ -19,7 +19,6 @@ from benchmarks.slam import board_page, score
 from benchmarks.slam.arena.sets import ArenaConfig, make_arena
 from benchmarks.slam.board import BoardConfig, make_board
 from benchmarks.slam.score import ProgramScore, ScoreConfig, score_all
-from benchmarks.slam.submission import SubmissionConfig, check_submission
 
 _progress = Console(stderr=True, highlight=False)
 _PROG = "python -m benchmarks.slam"
@@ -29,9 +28,6 @@ Example: {_PROG} arena --out out/arena"""
 _BOARD = f"""Run and score every program on sets of the arena.
 
 Example: {_PROG} board --sets out/arena --out out/board --jobs 2"""
-_CHECK = f"""Check that a submission can be scored, without the truth.
-
-Example: {_PROG} check --submission mine --recordings out/arena"""
 _SCORE = f"""Score TUM files against the truth.
 
 Example: {_PROG} score --estimate out/board/poses/arena/evalio-kiss --truth out/arena/truth --out out/scores"""
@@ -39,13 +35,12 @@ Example: {_PROG} score --estimate out/board/poses/arena/evalio-kiss --truth out/
 Command = (
     Annotated[ArenaConfig, tyro.conf.subcommand("arena", description=_ARENA)]
     | Annotated[BoardConfig, tyro.conf.subcommand("board", description=_BOARD)]
-    | Annotated[SubmissionConfig, tyro.conf.subcommand("check", description=_CHECK)]
     | Annotated[ScoreConfig, tyro.conf.subcommand("score", description=_SCORE)]
 )
 
 
-def main(config: ArenaConfig | BoardConfig | SubmissionConfig | ScoreConfig) -> None:
-    """Records, runs, checks or scores.
+def main(config: ArenaConfig | BoardConfig | ScoreConfig) -> None:
+    """Records, runs or scores.
 
     Raises:
         SubterraError: An input is missing or wrong, or an output cannot be written.
@@ -57,8 +52,6 @@ def main(config: ArenaConfig | BoardConfig | SubmissionConfig | ScoreConfig) -> 
         for name, result in make_board(config):
             _progress.print(f"{name}: {result}")
         _write_board(config.out)
-    elif isinstance(config, SubmissionConfig):
-        print("\n".join(check_submission(config)))
     else:
         scores = score_all(config)
         if config.out is not None:

@@ -41,19 +41,19 @@ def _run_evalio(name: str, recording: Path) -> Poses:
     from evalio.pipelines import get_pipeline
     from evalio.types import ImuMeasurement
 
-    from benchmarks.slam.evalio_sets import open_set
+    from benchmarks.slam.evalio import EvalioRecording
 
-    dataset = next(iter(open_set(recording.parent.parent, [recording.name])))
+    given = EvalioRecording(recording)
     kind: Any = get_pipeline(name)
     program = kind()
     settings = kind.default_params()
     program.set_params(settings | {key: value for key, value in _CHANGES.items() if key in settings})
-    program.set_imu_params(dataset.imu_params())
-    program.set_lidar_params(dataset.lidar_params())
-    program.set_imu_T_lidar(dataset.imu_T_lidar())
+    program.set_imu_params(given.imu)
+    program.set_lidar_params(given.lidar)
+    program.set_imu_T_lidar(given.mount)
     program.initialize()
-    mount, seconds, rows = dataset.imu_T_lidar().to_mat(), 0.0, []
-    for sample in dataset.data_iter():
+    mount, seconds, rows = given.mount.to_mat(), 0.0, []
+    for sample in given.samples():
         started = time.perf_counter()
         (program.add_imu if isinstance(sample, ImuMeasurement) else program.add_lidar)(sample)
         seconds += time.perf_counter() - started

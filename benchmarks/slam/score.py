@@ -20,7 +20,6 @@ from benchmarks.slam.tracks import (
     align,
     axis_from_file,
     axis_from_path,
-    find_offset,
     read_track,
 )
 
@@ -119,8 +118,6 @@ class Score:
     ape_turn: Spread  # Spread of the attitude errors, °
     # Distance driven when the error of the station first exceeds 1 m, m; `None` where it never does
     reach: float | None = None
-    # How much later the estimate's clock is than the truth's, s, where that explains it better; else `None`
-    clock: float | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -164,8 +161,7 @@ def score_files(
     if axis is None and (truth.parent / AXIS_FILE).is_file():
         axis = truth.parent / AXIS_FILE
     line = axis_from_path(track.true_position) if axis is None else axis_from_file(axis)
-    score, curve = score_track(track, line, alignment, piece, name or estimate.stem)
-    return dataclasses.replace(score, clock=find_offset(estimate, truth, alignment)), curve
+    return score_track(track, line, alignment, piece, name or estimate.stem)
 
 
 LEAST_RATE = 1.0  # poses a second; fewer leave out where a program errs
@@ -323,7 +319,6 @@ def _pairs(folder: Path, truth: Path) -> list[tuple[Path, Path]]:
 HEAD = (
     "recording", "program", "driven, m", "covered %", "along at the end, m", "drift %", "along, m", "across, m",
     "up, m", "along % of pieces", "across % of pieces", "turn, °/m", "APE, m", "RPE, m",
-    "clock late, s",
 )  # fmt: skip
 _STYLES = ("-", "--", ":", "-.")
 
@@ -341,7 +336,7 @@ def as_rows(scores: list[ProgramScore]) -> list[tuple[str, ...]]:
             s.name, one.program, cell(s.distance, 1), cell(100.0 * s.covered, 0), f"{s.along_final:+.2f}",
             cell(s.drift), cell(s.along_rms, 3), cell(s.across_rms, 3), cell(s.up_rms, 3), cell(s.piece_along),
             cell(s.piece_across), cell(s.piece_turn, 3), cell(s.ape.rmse, 3),
-            cell(None if s.rpe is None else s.rpe.rmse, 3), cell(s.clock, 3),
+            cell(None if s.rpe is None else s.rpe.rmse, 3),
         ))  # fmt: skip
     return rows
 
@@ -351,8 +346,7 @@ def as_markdown(scores: list[ProgramScore]) -> str:
     first = scores[0].score
     return markdown_table(HEAD, as_rows(scores)) + (
         f"\nRoot mean squares over the recording, alignment `{first.alignment}`. Pieces are {first.piece:g} m of path: "
-        "RMS error of their motion in % of it. APE and RPE are root mean squares as `evo` defines them. "
-        "A clock is stated where an offset of time lowers the errors by a fifth; they stand without it.\n"
+        "RMS error of their motion in % of it. APE and RPE are root mean squares as `evo` defines them.\n"
     )
 
 

@@ -139,37 +139,6 @@ def read_track(estimate: Path, truth: Path, alignment: Alignment = "origin") -> 
     return align(_pair(*_load(estimate, truth)), alignment)
 
 
-_OFFSETS, _FINE = np.arange(-1.0, 1.02, 0.04), np.arange(-0.02, 0.0205, 0.001)  # s, of the estimate's clock
-_LEAST = 1e-3  # m; a smaller error needs no offset
-_EXPLAINS = 0.8  # share of the error below which an offset explains an estimate better
-
-
-def find_offset(estimate: Path, truth: Path, alignment: Alignment) -> float | None:
-    """Returns how much later the clock of an estimate is than the truth's, s, where that explains it better.
-
-    Errors are root mean squares over positions, after the best rigid fit unless the `alignment` is `none`; the result
-    is `None` where no offset up to 1 s lowers them by a fifth, or they are below 1 mm. Raises `BenchmarkError` as
-    `read_track` does.
-    """
-    estimated, true = _load(estimate, truth)
-    fit: Alignment = "none" if alignment == "none" else "se3"
-
-    def error(offset: float) -> float:
-        try:
-            moved = dataclasses.replace(estimated, times=estimated.times - offset)
-            track = align(_pair(moved, true), fit)
-        except BenchmarkError:
-            return np.inf
-        return float(np.sqrt(np.mean(np.sum((track.position - track.true_position) ** 2, axis=1))))
-
-    given = error(0.0)
-    if given < _LEAST:
-        return None
-    coarse = min(_OFFSETS, key=error)
-    best = min(coarse + _FINE, key=error)
-    return float(best) if error(best) < _EXPLAINS * given else None
-
-
 def _load(estimate: Path, truth: Path) -> tuple[Trajectory, Trajectory]:
     try:
         return load_tum(estimate), load_tum(truth)

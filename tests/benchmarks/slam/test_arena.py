@@ -1,6 +1,5 @@
 """Recordings of the arena: layouts of the drivers, both kinds of bag, the IMU at rest, wheels, dust, and mistakes."""
 
-import hashlib
 import json
 from dataclasses import replace
 from itertools import islice
@@ -79,20 +78,18 @@ def _recording(folder: Path, name: str) -> Path:
     return place
 
 
-def test_evalio_loads_a_recording_with_its_own_classes(made, monkeypatch):
+def test_evalio_is_given_a_recording_as_images_of_points(made):
     name, folder = made
-    _recording(folder, name)
     from evalio.types import ImuMeasurement
 
-    from benchmarks.slam import evalio_sets
+    from benchmarks.slam.evalio import EvalioRecording
 
-    monkeypatch.setenv(evalio_sets.SET, str(folder))
-    (one,) = evalio_sets.open_set(folder / "set", ["one"])
-    samples = list(one.data_iter())
+    one = EvalioRecording(_recording(folder, name))
+    samples = list(one.samples())
     sweeps = [s for s in samples if not isinstance(s, ImuMeasurement)]
     assert len(samples) - len(sweeps) >= 40
     raw = [sweep_points(m) for topic, _, m in content(folder / bags.MCAP) if topic == TOPICS[name]]
-    facts = one.lidar_params()
+    facts = one.lidar
     for sweep, points in zip(sweeps, raw, strict=True):
         xyz = np.array([(p.x, p.y, p.z, p.row, p.t.to_sec()) for p in sweep.points])
         assert len(xyz) == facts.num_rows * facts.num_columns
@@ -101,7 +98,7 @@ def test_evalio_loads_a_recording_with_its_own_classes(made, monkeypatch):
         told = np.column_stack([points["x"], points["y"], points["z"], points["ring"], 1e-9 * points["t"]])[valid]
         assert seen.sum() == valid.sum()
         np.testing.assert_allclose(np.sort(xyz[seen], axis=0), np.sort(told, axis=0), atol=2e-6)
-    np.testing.assert_allclose(one.imu_T_lidar().trans, record.IMU.shift)
+    np.testing.assert_allclose(one.mount.trans, record.IMU.shift)
 
 
 def test_layouts_are_those_of_the_drivers(made):
@@ -273,33 +270,3 @@ def test_a_set_is_resumed_and_a_program_keeps_to_furnished_walls_and_loses_smoot
     assert drift["walls-furnished"] < 1.0
     assert drift["walls-smooth"] > 50.0
     assert drift["dust-lock"] > 50.0
-
-
-def test_a_set_describes_its_files_and_courses(tmp_path):
-    plan = sets.plan_arena(sets.ArenaConfig(tmp_path, ("walls-joints", "beams-06")))
-    for one in plan:
-        scene = record.draw_scene(replace(one, distance=5.0), SEED)
-        folder = tmp_path / "recordings" / one.name
-        (folder / "recording").mkdir(parents=True)
-        (folder / "recording" / "recording.mcap").write_bytes(one.name.encode())
-        (folder / "calibration.yaml").write_text(json.dumps(record.calibration(scene)))
-    (tmp_path / "truth").mkdir()
-    (tmp_path / "truth" / "lidar.tum").write_text("secret")
-    sets.describe_set(tmp_path, plan)
-    content = json.loads((tmp_path / "croissant.json").read_text())
-    files = {one["contentUrl"]: one["sha256"] for one in content["distribution"]}
-    told = {str(path.relative_to(tmp_path)) for path in (tmp_path / "recordings").rglob("*") if path.is_file()}
-    assert set(files) == told
-    for name, digest in files.items():
-        assert hashlib.sha256((tmp_path / name).read_bytes()).hexdigest() == digest
-    (courses,) = content["recordSet"]
-    fields = {one["@id"] for one in courses["field"]}
-    assert courses["key"]["@id"] in fields
-    assert all(set(row) == fields for row in courses["data"])
-    assert [row["courses/name"] for row in courses["data"]] == ["walls-joints", "beams-06"]
-    sheet = (tmp_path / "datasheet.md").read_text()
-    assert "{" not in sheet
-    assert "| beams-06 | furnished | avia, 6 lines | trolley | 0 | 45 |" in sheet
-    assert "noise of 0.00039 m/s²/√Hz and 0.00036 rad/s/√Hz" in sheet
-    croissant = pytest.importorskip("mlcroissant", reason="the validator is no dependency")
-    assert [*croissant.Dataset(jsonld=content).records("courses")]

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.command import BenchmarkError
 from benchmarks.slam.__main__ import command
-from benchmarks.slam.score import HEAD, ProgramScore, as_rows, score_files
+from benchmarks.slam.score import score_files
 from tests.benchmarks.slam.tracks import bend, line, write_axis, write_tum
 
 MOVE = Rotation.from_rotvec([0.1, -0.2, 1.9]), np.array([40.0, -7.0, 3.0])
@@ -239,17 +239,3 @@ def test_a_bad_axis_piece_or_standstill_is_refused(tmp_path):
         score_files(still, still)
     with pytest.raises(BenchmarkError, match="no alignment 'scale'"):
         score_files(truth, truth, alignment="scale")
-
-
-def test_an_estimate_whose_clock_is_late_has_the_offset_in_a_column_of_its_own(tmp_path):
-    time, position, rotation = bend()
-    position = position + 0.1 * np.column_stack([np.sin(3.0 * time), np.cos(2.0 * time), np.sin(4.0 * time)])
-    truth = write_tum(tmp_path / "truth.tum", time, position, rotation)
-    late = write_tum(tmp_path / "late.tum", time + 0.05, position, rotation)
-    found, _ = score_files(late, truth)
-    assert found.clock == pytest.approx(0.05, abs=2e-3)
-    assert found.ape.rmse > 0.02, "the errors stand without it"
-    noisy = position + np.random.default_rng(0).normal(0.0, 0.05, position.shape)
-    assert score_files(write_tum(tmp_path / "noisy.tum", time, noisy, rotation), truth)[0].clock is None
-    assert score_files(truth, truth)[0].clock is None
-    assert as_rows([ProgramScore("mine", found, None)])[0][HEAD.index("clock late, s")] == "0.050"
