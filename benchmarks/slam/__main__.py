@@ -65,7 +65,6 @@ def main(config: ArenaConfig | BoardConfig | ScoreConfig) -> None:
 def _write_scores(folder: Path, scores: list[ProgramScore]) -> None:
     write_file(folder / "scores.json", score.as_json(scores, environment_facts()).encode())
     write_file(folder / "scores.md", score.as_markdown(scores).encode())
-    write_file(folder / "scores.png", png_bytes(score.draw(scores), dpi=130))
 
 
 def _write_board(folder: Path) -> None:

@@ -5,10 +5,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 from jaxtyping import Float, Int
-from matplotlib.figure import Figure
 
 from benchmarks.command import BenchmarkError
 from benchmarks.results import markdown_table
@@ -259,16 +257,15 @@ class ScoreConfig:
     # `origin`: the first pose is known; `se3`: best fit; `none`: poses in the tunnel's frame.
     alignment: Alignment = "origin"
     piece: float = 10.0  # Length of the pieces of path for relative errors, m.
-    out: Path | None = None  # Folder for `scores.json`, `scores.md` and `scores.png`.
+    out: Path | None = None  # Folder for `scores.json` and `scores.md`.
 
 
 @dataclasses.dataclass(frozen=True)
 class ProgramScore:
-    """A score with its program and its errors against distance."""
+    """A score with its program."""
 
     program: str
     score: Score
-    curve: Curve
 
 
 def score_all(config: ScoreConfig) -> list[ProgramScore]:
@@ -288,10 +285,10 @@ def _score_path(path: Path, config: ScoreConfig) -> list[ProgramScore]:
     pairs = _pairs(path, config.truth) if path.is_dir() else [(path, _find_truth(path, config.truth))]
     program, scores = path.name if path.is_dir() else path.parent.name, []
     for estimate, truth in pairs:
-        score, curve = score_files(
+        score, _ = score_files(
             estimate, truth, axis=config.axis, alignment=config.alignment, piece=config.piece, name=estimate.stem
         )
-        scores.append(ProgramScore(program, score, curve))
+        scores.append(ProgramScore(program, score))
     return scores
 
 
@@ -320,7 +317,6 @@ HEAD = (
     "recording", "program", "driven, m", "covered %", "along at the end, m", "drift %", "along, m", "across, m",
     "up, m", "along % of pieces", "across % of pieces", "turn, °/m", "APE, m", "RPE, m",
 )  # fmt: skip
-_STYLES = ("-", "--", ":", "-.")
 
 
 def as_rows(scores: list[ProgramScore]) -> list[tuple[str, ...]]:
@@ -354,23 +350,3 @@ def as_json(scores: list[ProgramScore], facts: dict[str, Any]) -> str:
     """Returns `scores.json`."""
     rows = [{"program": one.program, **dataclasses.asdict(one.score)} for one in scores]
     return json.dumps({"schema": SCHEMA, **facts, "scores": rows}, indent=1, default=str) + "\n"
-
-
-def draw(scores: list[ProgramScore]) -> Figure:
-    """Draws errors against distance: a colour for each program, a line style for each recording."""
-    programs = list(dict.fromkeys(one.program for one in scores))
-    names = list(dict.fromkeys(one.score.name for one in scores))
-    figure, panels = plt.subplots(2, 1, figsize=(8.0, 6.0), sharex=True, layout="constrained")
-    for part, (axes, title) in enumerate(zip(panels, ("along the axis", "across it"), strict=True)):
-        for one in scores:
-            style = _STYLES[names.index(one.score.name) % len(_STYLES)]
-            axes.plot(
-                one.curve.travelled, one.curve.error[:, part], style, color=f"C{programs.index(one.program) % 10}",
-                lw=1.4, label=f"{one.program}, {one.score.name}",
-            )  # fmt: skip
-        axes.axhline(0.0, color="0.6", lw=0.8, zorder=0)
-        axes.set_ylabel(f"error {title}, m")
-        axes.grid(alpha=0.3)
-    panels[-1].set_xlabel("distance driven, m")
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8)
-    return figure

@@ -5,7 +5,7 @@ observation, so that the compiler cannot drop a ray and every observation is wri
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from time import perf_counter
 from typing import Any
 
@@ -56,69 +56,39 @@ class Speed:
         return float(lower), float(median), float(upper)
 
 
-@dataclass
-class Program:
-    """A compiled call and the results of its timed calls so far."""
-
-    n_envs: int  # Environments in the batch
-    steps: int  # Steps in one call
-    compile_seconds: float  # Time to trace and compile it, s
-    _call: Callable[..., Any]
-    _params: Any
-    _carry: Carry
-    _rates: list[float] = field(default_factory=list)
-    _done: list[float] = field(default_factory=list)
-    totals: list[float] = field(default_factory=list)  # Sum of the step outputs of each timed call
-
-    def call(self, key: PRNGKeyArray, keep: bool = True) -> float:
-        """Runs one call and returns its time, s.
-
-        Raises:
-            FloatingPointError: An observation or a reward is not finite.
-        """
-        started = perf_counter()
-        carry, total, done = jax.block_until_ready(self._call(key, self._carry, self._params))
-        elapsed = perf_counter() - started
-        if not np.isfinite(float(total)):
-            raise FloatingPointError(f"observations or rewards stopped being finite at n_envs={self.n_envs}")
-        self._carry = carry
-        if keep:
-            self._rates.append(self.n_envs * self.steps / elapsed)
-            self._done.append(float(done))
-            self.totals.append(float(total))
-        return elapsed
-
-    def speed(self) -> Speed:
-        """Returns the measurements of all its calls."""
-        share, total = float(np.mean(self._done)), float(np.sum(self.totals))
-        return Speed(self.n_envs, self.steps, self.compile_seconds, list(self._rates), share, total)
-
-
 def measure(loop: Loop, n_envs: int, timing: Timing) -> Speed:
-    """Times one loop."""
-    program = prepare(loop, n_envs, timing)
+    """Times one loop after a call that warms it up; calls get fewer steps if they would take too long.
+
+    Raises:
+        FloatingPointError: An observation or a reward is not finite.
+    """
+    begin = jax.block_until_ready(jax.jit(loop.reset)(jax.random.key(timing.seed), loop.params))
+    steps, fewer = 0, timing.steps
+    while fewer < 0.7 * steps or not steps:  # a second compilation is worth its time if it saves a third
+        steps, started = fewer, perf_counter()
+        call = jax.jit(_many_steps(loop, steps)).lower(jax.random.key(0), begin, loop.params).compile()
+        compile_seconds = perf_counter() - started
+        elapsed, carry, *_ = _timed(call, jax.random.key(timing.seed), begin, loop.params, n_envs)
+        fewer = max(1, min(steps, int(steps * timing.seconds / (timing.repeats * elapsed))))
+    rates, totals, ended = [], [], []
     for key in jax.random.split(jax.random.key(timing.seed + 1), timing.repeats):
-        program.call(key)
-    return program.speed()
+        elapsed, carry, total, done = _timed(call, key, carry, loop.params, n_envs)
+        rates.append(n_envs * steps / elapsed)
+        totals.append(total)
+        ended.append(done)
+    return Speed(n_envs, steps, compile_seconds, rates, float(np.mean(ended)), float(np.sum(totals)))
 
 
-def prepare(loop: Loop, n_envs: int, timing: Timing) -> Program:
-    """Compiles a call and runs it once; gives it fewer steps if the calls would take too long."""
-    carry = jax.block_until_ready(jax.jit(loop.reset)(jax.random.key(timing.seed), loop.params))
-    program = _compile(loop, n_envs, timing.steps, carry)
-    elapsed = program.call(jax.random.key(timing.seed), keep=False)
-    steps = max(1, min(timing.steps, int(timing.steps * timing.seconds / (timing.repeats * elapsed))))
-    # A second compilation is worth its time if it saves a third.
-    if steps < 0.7 * timing.steps:
-        program = _compile(loop, n_envs, steps, carry)
-        program.call(jax.random.key(timing.seed), keep=False)
-    return program
-
-
-def _compile(loop: Loop, n_envs: int, steps: int, carry: Carry) -> Program:
+def _timed(
+    call: Callable[..., Any], key: PRNGKeyArray, carry: Carry, params: Any, n_envs: int
+) -> tuple[float, Carry, float, float]:
+    """Returns the time of a call, s, the state after it, the sum of its outputs and the share of episodes that end."""
     started = perf_counter()
-    call = jax.jit(_many_steps(loop, steps)).lower(jax.random.key(0), carry, loop.params).compile()
-    return Program(n_envs, steps, perf_counter() - started, call, loop.params, carry)
+    carry, total, done = jax.block_until_ready(call(key, carry, params))
+    elapsed = perf_counter() - started
+    if not np.isfinite(float(total)):
+        raise FloatingPointError(f"observations or rewards stopped being finite at n_envs={n_envs}")
+    return elapsed, carry, float(total), float(done)
 
 
 def _many_steps(loop: Loop, steps: int) -> Callable[..., Any]:

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
+from benchmarks.throughput import timing
 from benchmarks.throughput.config import ThroughputConfig
 from benchmarks.throughput.loops import environment_loop
-from benchmarks.throughput.timing import Loop, Timing, digest, measure, prepare
+from benchmarks.throughput.timing import Loop, Timing, digest, measure
 
 
 def counting(first: float = 0.0) -> Loop:
@@ -27,15 +28,15 @@ def test_every_observation_is_in_the_checksum():
     assert len(speed.steps_per_second) == 2
 
 
-def test_a_rate_counts_the_steps_of_every_environment():
-    program = prepare(counting(), 3, Timing(steps=4))
-    elapsed = program.call(jax.random.key(0))
-    assert program.speed().steps_per_second == [pytest.approx(3 * 4 / elapsed)]
+def test_a_rate_counts_the_steps_of_every_environment(monkeypatch):
+    clock = iter(range(0, 100, 2))
+    monkeypatch.setattr(timing, "perf_counter", lambda: next(clock))  # each call takes 2 s
+    assert measure(counting(), 3, Timing(steps=4, repeats=2)).steps_per_second == [3 * 4 / 2.0] * 2
 
 
 def test_calls_get_fewer_steps_where_they_would_take_too_long():
-    assert prepare(counting(), 3, Timing(steps=50, repeats=20, seconds=1e-9)).steps == 1
-    assert prepare(counting(), 3, Timing(steps=50, repeats=20, seconds=1e9)).steps == 50
+    assert measure(counting(), 3, Timing(steps=50, repeats=2, seconds=1e-9)).steps == 1
+    assert measure(counting(), 3, Timing(steps=50, repeats=2, seconds=1e9)).steps == 50
 
 
 def test_what_is_not_finite_stops_the_run():
@@ -51,13 +52,8 @@ def test_one_number_of_any_observation_changes_the_digest():
 
 
 def test_the_same_seed_measures_the_same_steps():
-    env, params = st.make("Subterra/TraverseShort-v1")
-    program = prepare(environment_loop(env, params, 4), 4, Timing(steps=3))
-    begin = program._carry
-    for seed in (0, 0, 1):
-        program._carry = begin
-        program.call(jax.random.key(seed))
-    first, again, other = program.totals
+    loop = environment_loop(*st.make("Subterra/TraverseShort-v1"), 4)
+    first, again, other = (measure(loop, 4, Timing(3, 1, seed=seed)).checksum for seed in (0, 0, 1))
     assert first == again
     assert first != other
 
