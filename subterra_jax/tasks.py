@@ -217,7 +217,9 @@ def make(
     id = find(id)
     if motion not in MOTIONS or (motion != MOTIONS[0] and id not in TASKS):
         raise ValueError(f"{id} has no motion {motion!r}; it has {', '.join(MOTIONS) if id in TASKS else 'legs'}")
-    if motion == ROVER and tunnel is None and overrides.get("scene") is not None:
+    if motion == ROVER and overrides.get("scene") is not None:
+        if tunnel is not None:
+            raise ValueError(f"either a tunnel or a scene, got both {str(tunnel)!r} and {str(overrides['scene'])!r}")
         tunnel = Path(overrides["scene"]) / "tunnel.npz"
     if id in TASKS:
         tunnel = tunnel_for(id, tunnel, split, spatial=not is_planar(sensor))

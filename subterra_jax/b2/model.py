@@ -94,4 +94,6 @@ def _add_trunk_geom(trunk: mujoco.MjsBody) -> None:
         )  # fmt: skip
 
 
-B2 = Machine(robot_spec, "base_link", tuple(f"{leg}_foot" for leg in b2.LEGS), b2.BUMPERS, dress=dress)
+B2 = Machine(
+    "B2", b2.ENVELOPE[1], robot_spec, "base_link", tuple(f"{leg}_foot" for leg in b2.LEGS), b2.BUMPERS, dress=dress
+)

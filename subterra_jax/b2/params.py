@@ -1,5 +1,7 @@
 """Params, state and random numbers of the walking task."""
 
+import dataclasses
+
 from flax import struct
 from jaxtyping import Array, Float, Int
 
@@ -121,11 +123,11 @@ class WalkParams:
 
     tunnel: Tunnel
     track: Track
-    gait: GaitParams
-    command: CommandParams
-    randomisation: RandomisationParams
-    sensor: SensorParams
-    reward: WalkRewardParams
+    gait: GaitParams = dataclasses.field(default_factory=GaitParams)
+    command: CommandParams = dataclasses.field(default_factory=CommandParams)
+    randomisation: RandomisationParams = dataclasses.field(default_factory=RandomisationParams)
+    sensor: SensorParams = dataclasses.field(default_factory=SensorParams)
+    reward: WalkRewardParams = dataclasses.field(default_factory=WalkRewardParams)
     action_scale: Array | tuple[float, float, float] = (0.2, 0.3, 0.3)
     horizon: int = 1000
     fall_height: float = 0.25
@@ -134,81 +136,46 @@ class WalkParams:
 
 @struct.dataclass
 class Proprioception:
-    """Readings of the robot's own sensors, with noise.
+    """Readings of the robot's own sensors, with noise."""
 
-    Attributes:
-        rates: Rates of the trunk in its own axes, rad/s.
-        gravity: Direction of gravity in the trunk's axes.
-        angles: Joint angles, rad.
-        speeds: Joint speeds, rad/s.
-        velocity: Smoothed velocity of the trunk from its standing legs, forward and to the left, m/s.
-    """
-
-    rates: Float[Array, "3"]
-    gravity: Float[Array, "3"]
-    angles: Float[Array, "12"]
-    speeds: Float[Array, "12"]
-    velocity: Float[Array, "2"]
+    rates: Float[Array, "3"]  # rates of the trunk in its own axes, rad/s
+    gravity: Float[Array, "3"]  # direction of gravity in the trunk's axes
+    angles: Float[Array, "12"]  # joint angles, rad
+    speeds: Float[Array, "12"]  # joint speeds, rad/s
+    velocity: Float[Array, "2"]  # smoothed velocity of the trunk from its standing legs, forward and to the left, m/s
 
 
 @struct.dataclass
 class WalkState:
-    """State of one robot. Positions are from the anchor, which keeps them small.
+    """State of one robot. Positions are from the anchor, which keeps them small."""
 
-    Attributes:
-        body: State of the physics.
-        anchor: Row of the track nearest to the robot.
-        gait: State of the gait.
-        command: Commanded velocity forward and to the left (m/s), and yaw rate (rad/s).
-        drawn_command: Command as drawn, before it is changed to keep the robot between the rails.
-        facing: 1 towards growing station, -1 the other way.
-        action: Last action.
-        proprioception: Last readings of its own sensors.
-        build: Properties of this robot.
-        furthest: Largest station so far, m.
-        steps: Control periods in this episode.
-    """
-
-    body: Body
-    anchor: Int[Array, ""]
-    gait: GaitState
-    command: Float[Array, "3"]
-    drawn_command: Float[Array, "3"]
-    facing: Float[Array, ""]
-    action: Float[Array, "12"]
-    proprioception: Proprioception
-    build: Build
-    furthest: Float[Array, ""]
-    steps: Int[Array, ""]
+    body: Body  # state of the physics
+    anchor: Int[Array, ""]  # row of the track nearest to the robot
+    gait: GaitState  # state of the gait
+    command: Float[Array, "3"]  # commanded velocity forward and to the left (m/s), and yaw rate (rad/s)
+    drawn_command: Float[Array, "3"]  # command as drawn, before it is changed to keep the robot between the rails
+    facing: Float[Array, ""]  # 1 towards growing station, -1 the other way
+    action: Float[Array, "12"]  # last action
+    proprioception: Proprioception  # last readings of its own sensors
+    build: Build  # properties of this robot
+    furthest: Float[Array, ""]  # largest station so far, m
+    steps: Int[Array, ""]  # control periods in this episode
 
 
 @struct.dataclass
 class WalkResetNoise:
-    """Random numbers of one reset: uniform in [-1, 1).
+    """Random numbers of one reset: uniform in [-1, 1)."""
 
-    Attributes:
-        place: For station, lateral offset, heading, direction faced, clock of the gait.
-        build: For friction, mass, shift (3), stiffness (12), damping (12).
-        command: For the first command (3), and for standing.
-        sensor: Sensor noise, as in a step.
-    """
-
-    place: Float[Array, "*batch 5"]
-    build: Float[Array, "*batch 29"]
-    command: Float[Array, "*batch 4"]
-    sensor: Float[Array, "*batch 30"]
+    place: Float[Array, "*batch 5"]  # for station, lateral offset, heading, direction faced, clock of the gait
+    build: Float[Array, "*batch 29"]  # for friction, mass, shift (3), stiffness (12), damping (12)
+    command: Float[Array, "*batch 4"]  # for the first command (3), and for standing
+    sensor: Float[Array, "*batch 30"]  # sensor noise, as in a step
 
 
 @struct.dataclass
 class WalkStepNoise:
-    """Random numbers of one step: uniform in [-1, 1).
+    """Random numbers of one step: uniform in [-1, 1)."""
 
-    Attributes:
-        sensor: Noise of rates, gravity, angles and speeds.
-        command: For a new command (3), for standing, and for its arrival.
-        push: For a push (2), and for its arrival.
-    """
-
-    sensor: Float[Array, "*batch 30"]
-    command: Float[Array, "*batch 5"]
-    push: Float[Array, "*batch 3"]
+    sensor: Float[Array, "*batch 30"]  # noise of rates, gravity, angles and speeds
+    command: Float[Array, "*batch 5"]  # for a new command (3), for standing, and for its arrival
+    push: Float[Array, "*batch 3"]  # for a push (2), and for its arrival

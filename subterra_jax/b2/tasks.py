@@ -6,24 +6,20 @@ from typing import Any, Literal
 
 import jax.numpy as jnp
 
-from subterra_jax.b2 import constants as b2
-from subterra_jax.b2.gait import RELEASED, GaitParams, WalkPolicy, check_fits, load_policy
+from subterra_jax.b2.gait import RELEASED, WalkPolicy, check_fits, load_policy
 from subterra_jax.b2.mission import PERIODS, Legs
 from subterra_jax.b2.model import B2
-from subterra_jax.b2.params import CommandParams, RandomisationParams, SensorParams, WalkParams, WalkRewardParams
+from subterra_jax.b2.params import RandomisationParams, WalkParams
 from subterra_jax.b2.walk import WalkEnv
 from subterra_jax.constants import RANGE_MAX
 from subterra_jax.host.task_ids import B2_TRAVERSE, MISSIONS, WALK
 from subterra_jax.lidar3d.relief import Relief
 from subterra_jax.params import check_together, collect_entries, make_params
-from subterra_jax.parts import Odometer
+from subterra_jax.parts import Odometer, PlanarLidar, SpatialLidar
 from subterra_jax.parts.odometer import OdometryParams
 from subterra_jax.parts.spatial_lidar import SENSORS, SpatialParams, make_sensor
 from subterra_jax.parts.unicycle import VehicleParams
-from subterra_jax.physics.engine import Engine, MujocoEngine
-from subterra_jax.physics.ground import read_track
-from subterra_jax.physics.riding import SwayingLidar, SwayingSpatialLidar
-from subterra_jax.physics.rolling import ENGINES, check_width, world_of
+from subterra_jax.physics.stage import Stage, settle
 from subterra_jax.rules import StartParams, Traverse
 from subterra_jax.state import EnvParams, as_arrays
 from subterra_jax.tunnel import Tunnel
@@ -47,7 +43,6 @@ def make(
     *,
     scene: str | Path | None = None,
     engine: Literal["mjx", "mujoco"] = "mjx",
-    physics: Engine | None = None,
     driven: bool = False,
     privileged: bool = False,
     **overrides: Any,
@@ -62,7 +57,6 @@ def make(
         scene: A built scene folder, whose tunnel is taken; instead of `tunnel`.
         engine: `mjx`, for thousands on a GPU; or `mujoco`, in C on the host, for a few: in `scene.xml` where there is a
             scene.
-        physics: An engine of one's own with the robot, instead.
         driven: As for `WalkEnv`.
         privileged: As for `WalkEnv`.
         **overrides: Fields of `WalkParams` to replace.
@@ -70,38 +64,28 @@ def make(
     Raises:
         ValueError: No such task or field, or both a tunnel and a scene.
         TunnelError: The tunnel file is unreadable or wrong, or has no such lining.
-        TrackError: The tunnel is too short, or there is no such scene.
-        RobotError: The tunnel is narrower than the robot.
+        SubterraError: As `physics.stage.settle`.
     """
     if id != WALK:
         raise ValueError(f"no walking task {id!r}; there is {WALK}")
-    if scene is not None and tunnel is not None:
-        raise ValueError(f"either a tunnel or a scene, got both {str(tunnel)!r} and {str(scene)!r}")
-    if engine not in ENGINES:
-        raise ValueError(f"no engine {engine!r}; there are {', '.join(ENGINES)}")
     plan = _load(tunnel, scene)
-    check_width(plan, b2.ENVELOPE[1], "B2")
-    track = read_track(plan)
-    if physics is None:
-        world = world_of(plan, track, lining, scene) if engine == "mujoco" else None
-        physics = Engine(B2) if world is None else MujocoEngine(B2, world=world)
+    return _walker(settle(B2, [plan], lining, scene, engine), plan, lining, overrides, driven, privileged)
+
+
+def _walker(
+    stage: Stage, plan: TunnelPlan, lining: str | None, fields: dict[str, Any], driven: bool, privileged: bool = False
+) -> tuple[WalkEnv, WalkParams]:
     known = {field.name for field in dataclasses.fields(WalkParams)} - {"tunnel", "track"}
-    if unknown := set(overrides) - known:
+    if unknown := set(fields) - known:
         raise ValueError(f"no field {sorted(unknown)} in WalkParams; there are {sorted(known)}")
-    fields = {
-        "gait": GaitParams(),
-        "command": CommandParams(),
-        "randomisation": RandomisationParams(),
-        "sensor": SensorParams(),
-        "reward": WalkRewardParams(),
-        **overrides,
-    }
-    params = WalkParams(tunnel=Tunnel.from_plan(plan, lining), track=track, **fields)
-    env = WalkEnv(id=id, physics=physics, driven=driven, privileged=privileged)
+    params = WalkParams(tunnel=Tunnel.from_plan(plan, lining), track=stage.track, **fields)
+    env = WalkEnv(physics=stage.engine, driven=driven, privileged=privileged)
     return env, as_arrays(params)
 
 
 def _load(tunnel: TunnelPlan | str | Path | None, scene: str | Path | None) -> TunnelPlan:
+    if scene is not None and tunnel is not None:
+        raise ValueError(f"either a tunnel or a scene, got both {str(tunnel)!r} and {str(scene)!r}")
     if scene is not None:
         return load_tunnel(Path(scene) / "tunnel.npz")
     return tunnel if isinstance(tunnel, TunnelPlan) else load_tunnel(tunnel)
@@ -140,17 +124,16 @@ def make_mission(
     Raises:
         ValueError: No such task, engine or field.
         TunnelError: The tunnel file is unreadable or wrong, or has no such lining.
-        TrackError: The tunnel is too short, or there is no such scene.
-        RobotError: The tunnel is narrower than the robot.
+        SubterraError: As `physics.stage.settle`.
         PolicyError: There is no such gait, or it does not fit the robot.
     """
     if id not in MISSIONS:
         raise ValueError(f"no task {id!r}; there are {', '.join(MISSIONS)}")
+    plan = _load(tunnel, scene)
+    stage = settle(B2, [plan], lining, scene, engine)
     # No pushes on the way.
-    parts = {"randomisation": RandomisationParams(push=0.0), "sensor": SensorParams(), **(walk or {})}
-    walker, walking = make(WALK, tunnel, lining, scene=scene, engine=engine, driven=True, **parts)
-    if scene is not None:
-        relief = relief or Relief.from_plan(load_tunnel(Path(scene) / "tunnel.npz"), lining)
+    own_walk = {"randomisation": RandomisationParams(push=0.0), **(walk or {})}
+    walker, walking = _walker(stage, plan, lining, own_walk, driven=True)
     spatial = not (isinstance(sensor, str) and sensor == SENSORS[0])
     if spatial:
         made = sensor if isinstance(sensor, SpatialParams) else make_sensor(sensor)
@@ -161,9 +144,9 @@ def make_mission(
         source = tunnel if scene is None else Path(scene) / "tunnel.npz"
         walking = dataclasses.replace(walking, tunnel=resolve(source, lining, None, RANGE_MAX, spatial=True))
     trained = _gait(policy, walker.observation_size(walking))
-    own = {"walk": walking, "track": walking.track, "policy": trained, "relief": relief}
+    own = {"walk": walking, "track": walking.track, "policy": trained, "relief": relief or stage.relief}
     legs = Legs(walk=walker)
-    lidar = SwayingSpatialLidar(motion=legs) if spatial else SwayingLidar(motion=legs)
+    lidar = legs.carried(SpatialLidar() if spatial else PlanarLidar())
     env = TunnelEnv(id=id, rule=Traverse(), parts=(Odometer(), lidar), motion=legs)
     fields: dict[str, Any] = {
         "vehicle": VEHICLE,
@@ -175,7 +158,8 @@ def make_mission(
             f"{env.id} has no {sorted(given)} to replace; `tunnel=`, `walk=`, `policy=` and `relief=` make them"
         )
     horizon = overrides.pop("horizon", HORIZON)
-    params = make_params(env, walking.tunnel, horizon, collect_entries(env, {**fields, **own, **overrides}))
+    entries = stage.with_start(collect_entries(env, {**fields, **own, **overrides}), "start" in overrides)
+    params = make_params(env, walking.tunnel, horizon, entries)
     check_together(env, params)
     _check_period(params, PERIODS * walker.physics.period)
     return env, params
@@ -191,9 +175,7 @@ def _check_period(params: EnvParams, commanded: float) -> None:
 def _gait(policy: WalkPolicy | str | Path, size: int) -> WalkPolicy | None:
     if policy == TROT:
         return None
-    if isinstance(policy, str | Path):
-        source, (policy, _) = policy, load_policy(policy)
-    else:
-        source = policy.name
-    check_fits(policy, size, source)
-    return policy
+    source = policy.name if isinstance(policy, WalkPolicy) else policy
+    trained = policy if isinstance(policy, WalkPolicy) else load_policy(policy)[0]
+    check_fits(trained, size, source)
+    return trained

@@ -38,38 +38,25 @@ def set_options(spec: mujoco.MjSpec) -> None:
 
 @struct.dataclass
 class Body:
-    """State of the physics; positions from the anchor.
+    """State of the physics; positions from the anchor."""
 
-    Attributes:
-        qpos: Trunk's position (m) and quaternion, joint angles (rad).
-        qvel: Trunk's velocity (m/s, world axes) and rates (rad/s, its own axes), joint speeds (rad/s).
-        warmstart: Accelerations of the last step, from which the solver starts.
-        act: States of actuators that lag behind their controls; none by default.
-    """
-
-    qpos: Float[Array, "n_qpos"]
+    qpos: Float[Array, "n_qpos"]  # trunk's position (m) and quaternion, joint angles (rad)
+    # trunk's velocity (m/s, world axes) and rates (rad/s, its own axes), joint speeds (rad/s)
     qvel: Float[Array, "n_qvel"]
-    warmstart: Float[Array, "n_qvel"]
+    warmstart: Float[Array, "n_qvel"]  # accelerations of the last step, from which the solver starts
+    # states of actuators that lag behind their controls; none by default
     act: Float[Array, "n_act"] = dataclasses.field(default_factory=lambda: jnp.zeros(0))
 
 
 @struct.dataclass
 class Build:
-    """Properties of one robot, as drawn by domain randomisation.
+    """Properties of one robot, as drawn by domain randomisation."""
 
-    Attributes:
-        friction: Friction of feet or wheels.
-        mass: Factor on every mass and inertia.
-        shift: Shift of the trunk's centre of mass, m.
-        stiffness: Factor on each servo's stiffness.
-        damping: Factor on each servo's damping.
-    """
-
-    friction: Float[Array, ""]
-    mass: Float[Array, ""]
-    shift: Float[Array, "3"]
-    stiffness: Float[Array, "n_servos"]
-    damping: Float[Array, "n_servos"]
+    friction: Float[Array, ""]  # friction of feet or wheels
+    mass: Float[Array, ""]  # factor on every mass and inertia
+    shift: Float[Array, "3"]  # shift of the trunk's centre of mass, m
+    stiffness: Float[Array, "n_servos"]  # factor on each servo's stiffness
+    damping: Float[Array, "n_servos"]  # factor on each servo's damping
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,6 +64,8 @@ class Machine:
     """A robot for the engine. Its spec holds it alone, on a free joint.
 
     Attributes:
+        name: What it is called in sentences.
+        width: Its width, m.
         spec: Makes its MJCF.
         trunk: The body on the free joint.
         treads: Balls that touch the ground.
@@ -85,6 +74,8 @@ class Machine:
         dress: Adds looks for pictures; None where the spec has them.
     """
 
+    name: str
+    width: float
     spec: Callable[[], mujoco.MjSpec]
     trunk: str
     treads: tuple[str, ...]

@@ -13,7 +13,7 @@ from subterra_jax.lidar import LidarParams, cast
 from subterra_jax.lidar3d import beams
 from subterra_jax.lidar3d.relief import Relief
 from subterra_jax.lidar3d.space import into_tunnel, turned
-from subterra_jax.parts import Drive, Moved, PlanarLidar, SensingState, SpatialLidar, Unicycle
+from subterra_jax.parts import Drive, Moved, Part, PlanarLidar, SensingState, SpatialLidar, Unicycle
 from subterra_jax.parts.unicycle import wrap
 from subterra_jax.physics.engine import Body, Build, Engine
 from subterra_jax.physics.ground import Track, look_around, move_anchor
@@ -101,6 +101,12 @@ class Physical(Unicycle):
     def ride(self, own: Any) -> Ride:
         """Return the robot of the motion's state."""
         return own
+
+    def carried(self, part: Part) -> Part:
+        """Return a LiDAR as this robot carries it; other parts as they are."""
+        if isinstance(part, SpatialLidar):
+            return SwayingSpatialLidar(motion=self)
+        return SwayingLidar(motion=self) if isinstance(part, PlanarLidar) else part
 
     def moved(
         self,

@@ -2,46 +2,25 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any, ClassVar
 from xml.etree import ElementTree
 
 import jax.numpy as jnp
 import mujoco
-import numpy as np
 from jax import lax
 from jaxtyping import Array
 
 from subterra_jax.host import rover
-from subterra_jax.host.errors import SubterraError
-from subterra_jax.lidar3d.relief import Relief
 from subterra_jax.params import collect_entries
-from subterra_jax.parts import Drive, Moved, Part, PlanarLidar, SpatialLidar
-from subterra_jax.physics.engine import TIMESTEP, Body, Engine, Machine, MujocoEngine, set_options
-from subterra_jax.physics.ground import RAIL_HALF, RAIL_OFFSET, Track, join_tracks, read_track
-from subterra_jax.physics.riding import (
-    Physical,
-    Ride,
-    SwayingLidar,
-    SwayingSpatialLidar,
-    advance_period,
-    has_tipped,
-    place_on,
-)
-from subterra_jax.physics.stage import scene_file, scene_world, tunnel_world
+from subterra_jax.parts import Drive, Moved
+from subterra_jax.physics.engine import TIMESTEP, Body, Engine, Machine, set_options
+from subterra_jax.physics.riding import Physical, Ride, advance_period, has_tipped, place_on
+from subterra_jax.physics.stage import ENGINES, settle
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel import Tunnel
 from subterra_jax.tunnel.plan import TunnelPlan
 from subterra_jax.tunnel.sources import Source, list_sources, load_tunnel
 from subterra_jax.tunnel_env import TunnelEnv
-
-ENGINES = ("mjx", "mujoco")
-_MARGIN = 0.1  # to either side of a robot's envelope, m
-_ON_TRACK, _FROM_MOUTH = 0.3, 1.0  # of starts where none is given: largest lateral offset, least station, m
-
-
-class RobotError(SubterraError):
-    """A robot has no room, or cannot be built as asked."""
 
 
 def rover_spec() -> mujoco.MjSpec:
@@ -55,7 +34,9 @@ def rover_spec() -> mujoco.MjSpec:
     return spec
 
 
-ROVER = Machine(rover_spec, rover.NAME, rover.WHEELS, rover.BUMPERS, rover.WHEEL_HALF)
+ROVER = Machine(
+    "rover", 2.0 * rover.HALF_SIZE[1], rover_spec, rover.NAME, rover.WHEELS, rover.BUMPERS, rover.WHEEL_HALF
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,22 +75,6 @@ class Rover(Physical):
         contact = nearest < self.engine.reach
         return self.moved(state, ride, wheels, nearest, contact, jnp.any(fallen), tunnel, params)
 
-    def carried(self, part: Part) -> Part:
-        """Return a LiDAR as this robot carries it; other parts as they are."""
-        if isinstance(part, SpatialLidar):
-            return SwayingSpatialLidar(motion=self)
-        return SwayingLidar(motion=self) if isinstance(part, PlanarLidar) else part
-
-
-def check_width(plan: TunnelPlan, width: float, robot: str) -> None:
-    """Raise `RobotError` where a tunnel is narrower than a robot with 0.1 m to either side."""
-    needed, narrowest = width + 2.0 * _MARGIN, int(np.argmin(plan.half_width))
-    if (free := 2.0 * float(plan.half_width[narrowest])) < needed:
-        raise RobotError(
-            f"tunnel {plan.name!r} is {free:.2f} m wide at {plan.station[narrowest]:.1f} m; "
-            f"the {robot} needs {needed:.2f} m"
-        )
-
 
 def on_rover(
     env: TunnelEnv,
@@ -132,56 +97,17 @@ def on_rover(
         hidden_start: The start among them is not the user's own.
 
     Raises:
-        ValueError: There is no such engine or entry, the tunnel is a ready `Tunnel`, the engine in C gets many tunnels,
-            or the start may be in a wall.
-        RobotError: A tunnel is narrower than the robot.
-        TrackError: A tunnel is too short, or a scene has no floor.
+        ValueError: There is no such entry, the tunnel is a ready `Tunnel`, the start may be in a wall; or as `settle`.
+        SubterraError: As `settle`.
     """
     asked = dict(overrides)
     engine, scene = asked.pop("engine", ENGINES[0]), asked.pop("scene", None)
-    if engine not in ENGINES:
-        raise ValueError(f"no engine {engine!r}; there are {', '.join(ENGINES)}")
     plans = [_plan(source, piece) for source in ([tunnel] if isinstance(tunnel, Tunnel) else list_sources(tunnel))]
-    for plan in plans:
-        check_width(plan, 2.0 * rover.HALF_SIZE[1], "rover")
-    tracks, motion = [read_track(plan) for plan in plans], Rover()
-    if engine == "mujoco":
-        if len(plans) > 1:
-            raise ValueError(f"engine='mujoco' drives in one tunnel, got {len(plans)}")
-        motion = Rover(engine=MujocoEngine(ROVER, world=world_of(plans[0], tracks[0], lining, scene)))
+    stage = settle(ROVER, plans, lining, scene, engine)
+    motion = Rover(engine=stage.engine)
     env = dataclasses.replace(env, motion=motion, parts=tuple(motion.carried(part) for part in env.parts))
-    relief = None if scene is None else Relief.from_plan(plans[0], lining)
-    entries = collect_entries(env, {**asked, "track": join_tracks(tracks), "relief": relief})
-    room = min(float(plan.half_width.min()) for plan in plans) - rover.HALF_SIZE[1]
-    if any(float(track.rails[0]) > 0.0 for track in tracks):
-        room = min(room, RAIL_OFFSET - RAIL_HALF[0] - rover.HALF_SIZE[1])
-    return env, _with_start(entries, "start" in overrides and not hidden_start, room)
-
-
-def world_of(plan: TunnelPlan, track: Track, lining: str | None, scene: str | Path | None) -> Any:
-    """Return what makes the world of the engine in C: that of a scene, or that of a plan.
-
-    Raises:
-        TrackError: There is no such scene.
-    """
-    if scene is None:
-        return lambda: tunnel_world(plan, track, lining)
-    file = scene_file(scene, lining)
-    return lambda: scene_world(file)
-
-
-def _with_start(entries: Mapping[str, Any], given: bool, room: float) -> dict[str, Any]:
-    """Entries whose start leaves room beside the robot; a start of the user's that does not is refused."""
-    start = entries["start"]
-    lateral = float(np.max(np.asarray(start.lateral)))
-    if not given:
-        near = {"station": max(start.station, _FROM_MOUTH), "lateral": min(lateral, room, _ON_TRACK)}
-        return {**entries, "start": dataclasses.replace(start, **near)}
-    if lateral > room + 1e-6:
-        raise ValueError(
-            f"start.lateral = {lateral:g} m may put the rover into a wall or onto a rail; {room:.2f} m are free"
-        )
-    return dict(entries)
+    entries = collect_entries(env, {**asked, "track": stage.track, "relief": stage.relief})
+    return env, stage.with_start(entries, "start" in overrides and not hidden_start)
 
 
 def _plan(source: Source, piece: tuple[float, float] | None) -> TunnelPlan:

@@ -1,20 +1,113 @@
-"""A whole tunnel for MuJoCo's own engine, and for pictures: a scene as it was built, or ground and walls of a plan."""
+"""Where a robot is put: the ground of its tunnels, its engine, the room beside it; and a whole tunnel for MuJoCo in C.
 
+That is a scene as it was built, or ground and walls of a plan.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from subterra_jax.host.errors import SubterraError
 from subterra_jax.host.rover import GROUND, LOW_WALL, RAIL, ROLL
-from subterra_jax.physics.ground import RAIL_HALF, RAIL_OFFSET, SLEEPER_HALF, Track, TrackError
+from subterra_jax.lidar3d.relief import Relief
+from subterra_jax.physics.engine import Engine, Machine, MujocoEngine
+from subterra_jax.physics.ground import RAIL_HALF, RAIL_OFFSET, SLEEPER_HALF, Track, TrackError, join_tracks, read_track
 from subterra_jax.tunnel.plan import TunnelPlan
 
+ENGINES = ("mjx", "mujoco")
+_MARGIN = 0.1  # to either side of a robot, m
+_ON_TRACK, _FROM_MOUTH = 0.3, 1.0  # of starts where none is given: largest lateral offset, least station, m
 _SCOUT = "scout"  # the robot that a scene comes with
 _DEEP, _THICK = 0.05, 0.1  # half of a sleeper's or slab's box; of a wall, m
 _WALL = (0.5, 2.0)  # walls reach from so far below the ground to so far above it, m
 _OVERLAP, _PORCH = 0.01, 3.0  # of slabs, m: over the next one, and beyond the mouths
 _BED, _RAIL, _SLEEPER = (0.35, 0.33, 0.31, 1.0), (0.40, 0.33, 0.28, 1.0), (0.62, 0.61, 0.58, 1.0)
+
+
+class RobotError(SubterraError):
+    """A robot has no room."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Stage:
+    """Where a robot is put.
+
+    Attributes:
+        track: The ground of its tunnels.
+        engine: The engine with the robot.
+        relief: Surface of a scene, which the LiDAR sees; None without a scene.
+        room: Distance to either side of the axis at which no side of the robot is at a wall or a rail, m.
+    """
+
+    track: Track
+    engine: Engine
+    relief: Relief | None
+    room: float
+
+    def with_start(self, entries: Mapping[str, Any], given: bool) -> dict[str, Any]:
+        """Return entries whose start leaves room beside the robot.
+
+        Args:
+            given: The start is the user's own.
+
+        Raises:
+            ValueError: It is, and does not.
+        """
+        start = entries["start"]
+        lateral = float(np.max(np.asarray(start.lateral)))
+        if not given:
+            near = {"station": max(start.station, _FROM_MOUTH), "lateral": min(lateral, self.room, _ON_TRACK)}
+            return {**entries, "start": dataclasses.replace(start, **near)}
+        if lateral > self.room + 1e-6:
+            raise ValueError(
+                f"start.lateral = {lateral:g} m may put the {self.engine.machine.name} into a wall or onto a rail; "
+                f"{self.room:.2f} m are free"
+            )
+        return dict(entries)
+
+
+def settle(
+    machine: Machine, plans: Sequence[TunnelPlan], lining: str | None, scene: str | Path | None, engine: str
+) -> Stage:
+    """Put a robot into tunnels.
+
+    Args:
+        scene: Folder of the built scene that is the one tunnel, if it is.
+        engine: `mjx`, for thousands on a GPU; or `mujoco`, in C on the host, for a few: in `scene.xml` where there is a
+            scene.
+
+    Raises:
+        ValueError: There is no such engine, or that in C gets many tunnels.
+        RobotError: A tunnel is narrower than the robot with 0.1 m to either side.
+        TrackError: A tunnel is too short; or there is no such scene, or it has no floor.
+    """
+    if engine not in ENGINES:
+        raise ValueError(f"no engine {engine!r}; there are {', '.join(ENGINES)}")
+    needed = machine.width + 2.0 * _MARGIN
+    for plan in plans:
+        narrowest = int(np.argmin(plan.half_width))
+        if (free := 2.0 * float(plan.half_width[narrowest])) < needed:
+            raise RobotError(
+                f"tunnel {plan.name!r} is {free:.2f} m wide at {plan.station[narrowest]:.1f} m; "
+                f"the {machine.name} needs {needed:.2f} m"
+            )
+    tracks, made = [read_track(plan) for plan in plans], Engine(machine)
+    if engine == "mujoco":
+        if len(plans) > 1:
+            raise ValueError(f"engine='mujoco' drives in one tunnel, got {len(plans)}")
+        # A scene is read at once, so that what is wrong with it is said before the first step.
+        spec = None if scene is None else scene_world(scene_file(scene, lining))
+        made = MujocoEngine(machine, world=spec.copy if spec else lambda: tunnel_world(plans[0], tracks[0], lining))
+    room = min(float(plan.half_width.min()) for plan in plans)
+    if any(float(track.rails[0]) > 0.0 for track in tracks):
+        room = min(room, RAIL_OFFSET - RAIL_HALF[0])
+    relief = None if scene is None else Relief.from_plan(plans[0], lining)
+    return Stage(join_tracks(tracks), made, relief, room - 0.5 * machine.width)
 
 
 def scene_file(scene: str | Path, lining: str | None) -> Path:

@@ -16,11 +16,12 @@ from gymnasium.error import ResetNeeded
 import subterra_jax as st
 from subterra_jax.adapters.kernel import pack
 from subterra_jax.b2 import tasks
-from subterra_jax.b2.params import CommandParams
+from subterra_jax.b2.params import CommandParams, SensorParams
 from subterra_jax.physics.ground import TrackError
-from subterra_jax.physics.rolling import RobotError
 from subterra_jax.physics.rotations import yaw
+from subterra_jax.physics.stage import RobotError
 from subterra_jax.policies import PolicyError
+from subterra_jax.rules import StartParams
 from tests.subterra_jax.drawn import draw
 
 ID = "Subterra/B2Traverse-v1"
@@ -35,7 +36,7 @@ def plan():
 @pytest.fixture(scope="module")
 def env(plan):
     """One environment, compiled with less zeal: half the time, the same numbers to rounding."""
-    made = gymnasium.make(ID, tunnel=plan, policy="trot", walk={"sensor": tasks.SensorParams(**QUIET)})
+    made = gymnasium.make(ID, tunnel=plan, policy="trot", walk={"sensor": SensorParams(**QUIET)})
     quick = {"xla_backend_optimization_level": 0}
     made.unwrapped.task.compile = lambda f, params, *like: partial(
         jax.jit(f).lower(params, *like).compile(quick), params
@@ -186,8 +187,17 @@ def test_who_asks_for_what_is_not_there_is_told_in_a_sentence(plan, tmp_path):
     with pytest.raises(RobotError, match=r"0\.60 m wide"):
         st.make(ID, narrow, policy="trot")
     shutil.copy(Path(st.__file__).parent / "data" / "subterra-351.npz", tmp_path / "tunnel.npz")
+    in_scene = {"scene": tmp_path, "engine": "mujoco"}
     with pytest.raises(TrackError, match=r"scene\.xml is missing"):
-        st.make(ID, scene=tmp_path, policy="trot", engine="mujoco")
+        st.make(ID, **in_scene, policy="trot")
+    (tmp_path / "scene.xml").write_text('<mujoco><worldbody><geom size="1" contype="8"/></worldbody></mujoco>')
+    for asked in ((ID, {}), ("Subterra/Traverse-v1", {"motion": "rover"})):
+        with pytest.raises(TrackError, match="the scene has no floor"):
+            st.make(asked[0], **in_scene, **asked[1])
+        with pytest.raises(ValueError, match="either a tunnel or a scene, got both 'metro'"):
+            st.make(asked[0], "metro", **in_scene, **asked[1])
+    with pytest.raises(ValueError, match=r"start\.lateral = 3 m may put the B2 into a wall"):
+        st.make(ID, plan, policy="trot", start=StartParams(lateral=3.0))
 
 
 DRAW = """

@@ -11,8 +11,8 @@ import subterra_jax as st
 from subterra_jax.b2 import constants as b2
 from subterra_jax.b2.observation import locate
 from subterra_jax.b2.tasks import make
-from subterra_jax.physics.rolling import RobotError
 from subterra_jax.physics.rotations import rotate
+from subterra_jax.physics.stage import RobotError
 from tests.subterra_jax.b2.conftest import N_ROBOTS
 from tests.subterra_jax.tunnels import straight, tunnel_arrays
 

@@ -1,6 +1,7 @@
 """The rover: it drives as reported where the ground lets it, and nothing lets it through."""
 
 import dataclasses
+import functools
 from types import SimpleNamespace
 
 import jax
@@ -13,8 +14,8 @@ from subterra_jax.host import rover
 from subterra_jax.physics.engine import Body, MujocoEngine
 from subterra_jax.physics.ground import RAIL_HALF, RAIL_OFFSET, join_tracks, read_track
 from subterra_jax.physics.riding import Ride, advance_period
-from subterra_jax.physics.rolling import ROVER, RobotError, Rover
-from subterra_jax.physics.stage import tunnel_world
+from subterra_jax.physics.rolling import ROVER, Rover
+from subterra_jax.physics.stage import ENGINES, RobotError, tunnel_world
 from subterra_jax.policies.opening import open_agent
 from subterra_jax.rules import StartParams
 from subterra_jax.tunnel import Tunnel
@@ -33,8 +34,8 @@ def plans(plan_of):
     return floor, dataclasses.replace(floor, shell=SimpleNamespace(track=sleepers(56, protrusion=0.06)))
 
 
-@pytest.fixture(scope="module", params=["mjx", "mujoco"])
-def drive(plans, request):
+@pytest.fixture(scope="module")
+def drives(plans):
     """Positions in the tunnel (m), heights over the floor (m) and velocities (m/s) of each control period, `(n, 3)`."""
     tracks, tunnel = [read_track(plan) for plan in plans], Tunnel.from_plan(plans[0], "smooth")
     both = join_tracks(tracks)
@@ -44,8 +45,8 @@ def drive(plans, request):
     quick = {"xla_backend_optimization_level": 0}
     compiled = []
 
-    def advance(laid, ride, control):
-        if request.param == "mujoco":
+    def advance(name, laid, ride, control):
+        if name == "mujoco":
             origin, engine = np.asarray(both.position)[ride.anchor], engines[laid]
             return Ride(engine.bench.run(ride.body, control, origin, None, engine.substeps), ride.anchor)
         if not compiled:
@@ -53,7 +54,7 @@ def drive(plans, request):
             compiled.append(jax.jit(one).lower(ride, control).compile(quick))
         return compiled[0](ride, control)
 
-    def run(laid, seconds, control, place=(10.0, 0.0, 0.0), yaw=0.0, velocity=(0.0, 0.0, 0.0)):
+    def run(name, laid, seconds, control, place=(10.0, 0.0, 0.0), yaw=0.0, velocity=(0.0, 0.0, 0.0)):
         anchor = both.nearest(jnp.float32(place[0]), laid)
         position = np.asarray(place) - np.asarray(both.position)[anchor]
         position[2] += rover.HEIGHT
@@ -62,13 +63,19 @@ def drive(plans, request):
         speed = rest.copy()
         speed[:3] = velocity
         ride, rows = Ride(Body(pose, speed, rest, np.zeros(2, np.float32)), anchor), []
-        for _ in range(round(seconds / PERIOD)):
-            ride = advance(laid, ride, np.array(control, np.float32))
+        for k in range(round(seconds / PERIOD)):
+            told = control(k * PERIOD) if callable(control) else control
+            ride = advance(name, laid, ride, np.array(told, np.float32))
             rows.append((np.asarray(both.position)[ride.anchor] + ride.body.qpos[:3], ride.body.qvel[:3]))
         where, velocity = (np.array(part) for part in zip(*rows, strict=True))
         return where - [0.0, 0.0, rover.HEIGHT], velocity
 
-    return run
+    return {name: functools.partial(run, name) for name in ENGINES}
+
+
+@pytest.fixture(params=ENGINES)
+def drive(drives, request):
+    return drives[request.param]
 
 
 def test_on_a_level_floor_it_goes_as_far_as_it_is_told(drive):
@@ -114,6 +121,18 @@ def test_energy_does_not_come_from_nothing(drive):
     assert energy.max() < 9.81 * 0.1 + 0.5 + 1e-3
     assert np.abs(velocity[-1]).max() < 0.02
     assert where[-1, 2] == pytest.approx(0.0, abs=0.01)
+
+
+def winding(most):
+    return lambda t: (0.6, most * np.cos(0.6 * t))
+
+
+def test_from_one_state_both_engines_drive_alike_for_ten_seconds(drives):
+    """Away from walls and rails, which turn a robot to one side or the other by a hair's breadth."""
+    for laid, most, aside in ((0, 0.25, 0.0), (1, 0.05, 0.1)):
+        in_mjx, in_c = (drive(laid, 10.0, winding(most), (10.0, aside, 0.0))[0] for drive in drives.values())
+        assert np.linalg.norm(in_mjx - in_c, axis=1).max() < 0.03
+        assert np.ptp(in_mjx[:, 0]) > 5.0
 
 
 @pytest.fixture(scope="module")
