@@ -2,9 +2,8 @@
 
 from typing import Any
 
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int
 
 from subterra_jax.b2 import constants as b2
 from subterra_jax.b2.gait import standing_gait
@@ -23,21 +22,6 @@ from subterra_jax.physics.rotations import compose, rotate, yaw_quaternion
 
 _LATERAL, _HEADING, _MARGIN = 0.2, 0.2, 25.0  # of starts: m, rad, m
 _TURN, _SIDESTEP, _AIM, _FREE = 1.5, 1.0, 1.5, 0.5  # of steering: 1/s, 1/s, rad/m, rad
-N_SENSOR = 30
-
-
-def draw_reset(key: PRNGKeyArray, batch: tuple[int, ...]) -> WalkResetNoise:
-    """Draws random numbers for a batch of resets; row i does not depend on the size of the batch."""
-    uniform = jax.random.uniform(key, (*batch, 38 + N_SENSOR), minval=-1.0)
-    return WalkResetNoise(
-        place=uniform[..., :5], build=uniform[..., 5:34], command=uniform[..., 34:38], sensor=uniform[..., 38:]
-    )
-
-
-def draw_step(key: PRNGKeyArray, batch: tuple[int, ...]) -> WalkStepNoise:
-    """Draws random numbers for one step of a batch; row i does not depend on the size of the batch."""
-    uniform = jax.random.uniform(key, (*batch, N_SENSOR + 8), minval=-1.0)
-    return WalkStepNoise(sensor=uniform[..., :N_SENSOR], command=uniform[..., N_SENSOR:-3], push=uniform[..., -3:])
 
 
 def begin(noise: WalkResetNoise, params: WalkParams) -> WalkState:

@@ -59,10 +59,10 @@ class Legs(Physical):
 
     def draw_reset(self, key: Keys, batch: Batch, params: EnvParams) -> WalkResetNoise:
         """Draw how the robot is built, and its first readings."""
-        return draws.draw_reset(key, batch)
+        return self.walk.draw_reset(key, batch, params.walk)
 
     def draw_step(self, key: PRNGKeyArray, batch: Batch, params: EnvParams) -> WalkStepNoise:
-        return draws.draw_step(key, (*batch, PERIODS))
+        return self.walk.draw_step(key, (*batch, PERIODS), params.walk)
 
     def begin(self, draw: WalkResetNoise, state: State, params: EnvParams) -> LegsState:
         return LegsState(stand(state, draw, params.walk))

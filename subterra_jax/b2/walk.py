@@ -16,7 +16,7 @@ from subterra_jax.env import Box, Info
 from subterra_jax.physics.engine import Body, Build, Engine
 from subterra_jax.physics.riding import Ride, advance_period
 
-N_ACTION = 12
+N_ACTION, N_SENSOR = 12, 30  # sizes of an action, and of the noise of the sensors
 _STIFFNESS, _DAMPING, _TORQUE = (
     np.tile(np.array([getattr(b2.JOINT[part], name) for part in b2.PARTS], np.float32), 4)
     for name in ("stiffness", "damping", "torque")
@@ -89,11 +89,15 @@ class WalkEnv:
 
     def draw_reset(self, key: PRNGKeyArray, batch: tuple[int, ...], params: WalkParams) -> WalkResetNoise:
         """Draws random numbers for a batch of resets; row i does not depend on the size of the batch."""
-        return draws.draw_reset(key, batch)
+        uniform = jax.random.uniform(key, (*batch, 38 + N_SENSOR), minval=-1.0)
+        return WalkResetNoise(
+            place=uniform[..., :5], build=uniform[..., 5:34], command=uniform[..., 34:38], sensor=uniform[..., 38:]
+        )
 
     def draw_step(self, key: PRNGKeyArray, batch: tuple[int, ...], params: WalkParams) -> WalkStepNoise:
         """Draws random numbers for one step of a batch; row i does not depend on the size of the batch."""
-        return draws.draw_step(key, batch)
+        uniform = jax.random.uniform(key, (*batch, N_SENSOR + 8), minval=-1.0)
+        return WalkStepNoise(sensor=uniform[..., :N_SENSOR], command=uniform[..., N_SENSOR:-3], push=uniform[..., -3:])
 
     def begin(self, noise: WalkResetNoise, params: WalkParams) -> WalkState:
         """Return the state at the start of an episode."""
