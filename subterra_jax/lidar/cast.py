@@ -92,7 +92,8 @@ def _following(
     n_beams, n_bits = direction.shape[0], (tunnel.n_scan - 1).bit_length()
     # Opposite beams share a line, and so everything but its sense.
     n_lines = n_beams if n_beams % 2 else n_beams // 2
-    box = lax.dynamic_slice_in_dim(tunnel.box, first, tunnel.n_scan, axis=1)
+    # Without the planes: a batch copies its windows.
+    box = lax.dynamic_slice_in_dim(tunnel.box[:6], first, tunnel.n_scan, axis=1)
     number = jnp.arange(tunnel.n_scan, dtype=jnp.int32)
     senses = _entries(box, number, n_bits, position, direction[:n_lines])
     following = []
@@ -106,7 +107,7 @@ def _following(
 
 
 def _entries(
-    box: Float[Array, "10 k"],
+    box: Float[Array, "6 k"],
     number: Int[Array, "k"],
     n_bits: int,
     position: Float[Array, "2"],
