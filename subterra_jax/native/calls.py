@@ -36,7 +36,7 @@ def _registered(name: str, work: Any) -> str:
     writable = make_writable(folder)
     _config.CACHE_DIR = str(folder) if writable else before
     try:
-        _alive.append(handler_of(work, name, cache=writable))
+        _alive.append(handler_of(work, name, max(1, cores() - 1), cache=writable))
     finally:
         _config.CACHE_DIR = before
     jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(_alive[-1][0].ctypes), platform="cpu", api_version=0)
@@ -57,7 +57,7 @@ def _call(name: str, work: Any, chunk: int, results: Any, *arguments: Any) -> An
 
     Args:
         work: As for `handler_of`.
-        chunk: Fewest rows of a thread: some 50 µs of work, or starting it does not pay.
+        chunk: Fewest rows of a thread: some 50 µs of work, or waking it does not pay.
         results: Shapes and types of its results.
         arguments: Arrays of 32-bit numbers; the first axis of the first counts rows.
     """

@@ -1,5 +1,11 @@
-"""Custom calls of XLA by plain pointers, without a C compiler: a handler shares the rows of a call among threads."""
+"""Custom calls of XLA by plain pointers, without a C compiler: a handler shares the rows of a call among threads.
 
+The threads wait for jobs at a pipe as long as the process lives: on virtual machines, to start one takes longer than
+its job.
+"""
+
+import os
+import threading
 from collections.abc import Callable
 from types import FunctionType
 from typing import Any, no_type_check
@@ -14,8 +20,11 @@ from numba.extending import intrinsic
 # XLA's interface "status returning, unified": results, operands, and three things that these calls do not use.
 API_VERSION = 3
 _HANDLER = types.void(*[types.intp] * 5)
-_create = types.ExternalFunction("pthread_create", signature(types.int32, *[types.intp] * 4))
-_join = types.ExternalFunction("pthread_join", signature(types.int32, *[types.intp] * 2))
+_read = types.ExternalFunction("read", signature(types.intp, types.int32, types.intp, types.intp))
+_write = types.ExternalFunction("write", signature(types.intp, types.int32, types.intp, types.intp))
+_yield = types.ExternalFunction("sched_yield", signature(types.int32))
+# What a job is: addresses of results and operands, rows from and to, and whether it is done.
+_RESULTS, _OPERANDS, _FROM, _TO, _DONE, _JOB = range(6)
 
 
 def _at(kind: types.Type) -> Any:
@@ -56,36 +65,51 @@ def result_of_many(addresses, i, size):
     return carray(_floats_at(_addresses_at(addresses)[i]), (size,))
 
 
+@intrinsic
+def _fence(typing: Any) -> Any:
+    """All that was written before is seen by those who see what is written after."""
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
+        builder.fence("seq_cst")
+        return context.get_dummy_value()
+
+    return signature(types.void), emit
+
+
 # Of each kernel: `handler_of` puts its own in their place.
-work, part = None, None
+work, pipe = None, None
 
 
 @no_type_check
-def _do_part(job):
-    results, operands, begin, end = carray(_addresses_at(job), (4,))
-    work(results, operands, begin, end)
-    return 0
+def _serve(jobs):
+    address = np.zeros(1, np.int64)
+    while True:
+        if _read(types.int32(jobs), address.ctypes.data, 8) == 8:
+            job = carray(_addresses_at(address[0]), (_JOB,))
+            work(job[_RESULTS], job[_OPERANDS], job[_FROM], job[_TO])
+            _fence()
+            job[_DONE] = 1
 
 
 @no_type_check
 def _answer(results, operands, _, _length, _status):
     sizes = _ints_at(_addresses_at(operands)[0])
     rows, n = sizes[0], sizes[1]
-    jobs, threads = np.empty((n, 4), np.int64), np.zeros(n, np.int64)
+    jobs, address = np.zeros((n, _JOB), np.int64), np.zeros(1, np.int64)
     for k in range(1, n):
-        jobs[k, 0], jobs[k, 1], jobs[k, 2], jobs[k, 3] = results, operands, rows * k // n, rows * (k + 1) // n
-        if _create(threads.ctypes.data + 8 * k, 0, part(), jobs.ctypes.data + 32 * k) != 0:
-            threads[k] = 0
+        jobs[k, _RESULTS], jobs[k, _OPERANDS] = results, operands
+        jobs[k, _FROM], jobs[k, _TO] = rows * k // n, rows * (k + 1) // n
+        address[0] = jobs.ctypes.data + 8 * _JOB * k
+        _write(types.int32(_addresses_at(pipe())[1]), address.ctypes.data, 8)
     work(results, operands, 0, rows // n)
     for k in range(1, n):
-        if threads[k] != 0:
-            _join(threads[k], 0)
-        else:
-            work(results, operands, jobs[k, 2], jobs[k, 3])
+        while jobs[k, _DONE] == 0:
+            _yield()
+    _fence()
 
 
 def _address_of(symbol: str) -> Any:
-    """Return a compiled function that gives the address of a C function."""
+    """Return a compiled function that gives an address, which machine code on disk leaves open."""
 
     @intrinsic
     def address(typing: Any) -> Any:
@@ -98,12 +122,13 @@ def _address_of(symbol: str) -> Any:
     return address
 
 
-def handler_of(work: Callable[..., None], name: str, cache: bool) -> tuple[Any, Any]:
-    """Return a handler of XLA's, and what its threads run; the first operand of a call is as `sizes_of` makes it.
+def handler_of(work: Callable[..., None], name: str, helpers: int, cache: bool) -> tuple[Any, ...]:
+    """Return a handler of XLA's, and what its threads need; the first operand of a call is as `sizes_of` makes it.
 
     Args:
         work: Compiled function of the addresses of a call's results and operands, and of two rows: from, to.
         name: Name of the kernel; must be unique.
+        helpers: Threads besides those that call; at least one.
         cache: Keep the machine code on disk.
     """
 
@@ -114,10 +139,12 @@ def handler_of(work: Callable[..., None], name: str, cache: bool) -> tuple[Any, 
         made.__name__ = made.__qualname__ = name + function.__name__
         return made
 
-    symbol = f"{name}_part"
-    do_part = cfunc(types.intp(types.intp), cache=cache)(own(_do_part, work=work))
-    binding.add_symbol(symbol, do_part.address)
-    return cfunc(_HANDLER, cache=cache)(own(_answer, work=work, part=_address_of(symbol))), do_part
+    symbol, pipe = f"{name}_pipe", np.array(os.pipe())
+    binding.add_symbol(symbol, pipe.ctypes.data)
+    serve = cfunc(types.void(types.intp), cache=cache)(own(_serve, work=work))
+    for _ in range(helpers):
+        threading.Thread(target=serve.ctypes, args=(pipe[0],), daemon=True).start()
+    return cfunc(_HANDLER, cache=cache)(own(_answer, work=work, pipe=_address_of(symbol))), serve, pipe
 
 
 def sizes_of(rows: int, threads: int, arguments: tuple[Any, ...]) -> np.ndarray:
