@@ -141,7 +141,7 @@ def look(env: TunnelEnv, agent: Agent, params: EnvParams, flat: Float[Array, n_o
 
 def in_tunnel(env: TunnelEnv, params: EnvParams, tunnel: Any, level: Any = None) -> EnvParams:
     """Return the params of one tunnel of a stack, and of one level where that is not negative."""
-    params = params.replace(tunnel=params.tunnel.pick(tunnel))
+    params = env.motion.in_tunnel(params, tunnel)
     if level is None:
         return params
 

@@ -48,6 +48,7 @@ class Command:
     intensity: bool = False  # the LiDAR gives intensities too
     texture: float = 0.0  # what they tell of the walls: from 0, all alike, to 1, an old, wet metro
     hidden_start: bool = False  # the true start is off the one that is reported
+    motion: Literal["wheels", "rover"] = "wheels"  # `rover` has mass: physics in MJX, best begun from a policy on wheels
     val: Path | None = None  # tunnels of the evaluation after training; those of the training if left out
     preset: str | None = None  # `cpu` or `gpu`; what jax runs on if left out
     seeds: tuple[int, ...] = ()  # train these seeds at once, each into `out/seed-<k>`
@@ -127,8 +128,10 @@ def _world(arguments: Command) -> World:
             arguments.hidden_start,
             arguments.intensity,
             arguments.texture,
+            arguments.motion,
         )
-    for name, usual in (("sensor", "planar16"), ("intensity", False), ("hidden_start", False), ("val", None)):
+    usual_of = {"sensor": "planar16", "intensity": False, "hidden_start": False, "val": None, "motion": "wheels"}
+    for name, usual in usual_of.items():
         if (given := getattr(arguments, name)) != usual:
             raise ConfigError(f"{name} = {given} is for embodiment = scout; with b2 it is {usual}")
     from train.b2 import embodied  # MuJoCo is loaded only where legs are meant

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import subterra_jax as st
 from subterra_jax.host.versions import VERSION
 from subterra_jax.policies import TRAINED_UNDER, training_conditions
-from subterra_jax.tasks import TaskError, find
+from subterra_jax.tasks import MOTIONS, TaskError, find
 from subterra_jax.tunnel.sources import tunnel_digest
 from train import tunnels
 from train.config import ConfigError
@@ -115,6 +115,7 @@ def open_world(
     hidden_start: bool = False,
     intensity: bool = False,
     texture: float = 0.0,
+    motion: str = MOTIONS[0],
 ) -> World:
     """Opens a task on a tunnel.
 
@@ -129,6 +130,7 @@ def open_world(
         hidden_start: The true start is off the one that is reported.
         intensity: The LiDAR gives intensities too.
         texture: Dial of what they tell, as for `st.make`.
+        motion: As for `st.make`.
 
     Raises:
         ConfigError: There is no such task or sensor, or the tunnel has no room for it.
@@ -138,13 +140,14 @@ def open_world(
     if tunnel is None and st.TASKS[task].rule.goal_kind != "cover":
         tunnel = _TUNNELS[preset or "cpu"]
     chosen = {"hidden_start": hidden_start, "intensity": intensity, "texture": texture}
+    chosen |= {"motion": motion} if motion != MOTIONS[0] else {}
     world = _open(task, tunnel, lining, sensor, chosen)
     return world if val is None else dataclasses.replace(world, val=_open(task, val, lining, sensor, chosen))
 
 
 def lidar_of(facts: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the arguments of `open_world` that say what a world's LiDAR shows."""
-    return {name: facts[name] for name in ("sensor", "intensity", "texture") if name in facts}
+    """Returns the arguments of `open_world` that say what a world's LiDAR shows, and how its robot moves."""
+    return {name: facts[name] for name in ("sensor", "intensity", "texture", "motion") if name in facts}
 
 
 def _open(task: str, tunnel: Path | str | None, lining: str | None, sensor: str, chosen: dict[str, Any]) -> World:

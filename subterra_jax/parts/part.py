@@ -263,6 +263,10 @@ class Motion(Part):
         """Draw what a motion needs beside `normals` and `uniforms`, for a whole batch at once."""
         return ()
 
+    def in_tunnel(self, params: EnvParams, tunnel: Any) -> EnvParams:
+        """Return params that hold one tunnel of a stack in place of all of them."""
+        return params.replace(tunnel=params.tunnel.pick(tunnel))
+
     @abc.abstractmethod
     def obey(self, action: Float[Array, n_action], state: State, params: EnvParams) -> Float[Array, 2]:
         """Return the command that the robot obeys: the action within its limits, a NaN read as 0."""

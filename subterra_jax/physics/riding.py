@@ -98,6 +98,11 @@ class Physical(Unicycle):
         """Return `vehicle`, the limits of a command; and `track`, the ground."""
         return {**super().defaults(), "track": None}
 
+    def in_tunnel(self, params: EnvParams, tunnel: Any) -> EnvParams:
+        """Return params that hold one tunnel of a stack; that tunnel's ground is the first there."""
+        params, track = super().in_tunnel(params, tunnel), params.track
+        return params.replace(track=track.replace(tunnel=track.tunnel - tunnel))
+
     def ride(self, own: Any) -> Ride:
         """Return the robot of the motion's state."""
         return own

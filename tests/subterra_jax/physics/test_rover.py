@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
+from subterra_jax.episode import Driver
 from subterra_jax.host import rover
 from subterra_jax.physics.engine import Body, MujocoEngine
 from subterra_jax.physics.ground import RAIL_HALF, RAIL_OFFSET, join_tracks, read_track
@@ -172,6 +173,16 @@ def test_its_task_is_that_of_the_kinematic_robot(task, plans):
     odometer = obs[:, env.fields(params)["distance"]] if "distance" in env.fields(params) else obs[:, 16:17]
     assert float(odometer[-1, 0]) == pytest.approx(mine[-1] - 1.0, abs=0.4)
     assert not any(bool(step[2]) for step in told)
+
+
+def test_in_a_stack_it_stands_on_the_ground_of_its_own_tunnel(plans):
+    env, params = st.make("Subterra/Traverse-v1", tunnel=[plans[1], *plans], motion="rover")
+    driver, agent = Driver(env), open_agent("dead-reckoning", env, params)
+    begun = driver.begin(params, agent, np.arange(3, dtype=np.uint32), np.arange(3))
+    rides = begun.state.parts["rover"]
+    place = params.track.position[rides.anchor] + rides.body.qpos[:, :3]
+    np.testing.assert_array_equal(params.track.tunnel[rides.anchor], [0, 1, 2])
+    np.testing.assert_allclose(place[:, :2], begun.state.position, atol=0.02)
 
 
 def test_a_wall_ends_its_episode_by_contact(task):
