@@ -1,54 +1,63 @@
-"""Counts the robots that get through a tunnel by physics: `python -m benchmarks.b2_traverse --robots 100`.
+"""Drives a policy on wheels, on the rover and on four legs: `python -m benchmarks.b2_traverse --robot rover`.
 
-Friction, mass, gains and sensor noise are drawn for every B2; `--robot rover` drives Scouts, all alike. With
-`--engine mujoco` the same robots walk in MuJoCo's own engine on the host, with `--scene DIR` in the scene itself.
+Robots of the same seeds have the same starts, goals and noise whatever moves them. Friction, mass, gains and sensor
+noise are drawn for every B2; rovers are all alike. With `--engine mujoco` they move in MuJoCo's own engine on the host,
+with `--scene DIR` in the scene itself.
 """
 
-import json
+import dataclasses
 import math
 import sys
 import time
-from dataclasses import dataclass, replace
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Literal
 
+import jax
 import numpy as np
 
 import subterra_jax as st
-from benchmarks.command import require_least, run_main
+from benchmarks.command import BenchmarkError, require_least, run_main
+from benchmarks.records import Record, measured, write_records
 from subterra_jax.b2 import tasks, transfer
 from subterra_jax.b2.gait import RELEASED
+from subterra_jax.evaluation import Episodes
 from subterra_jax.host.files import require_file
-from subterra_jax.parts.unicycle import VehicleParams
+from subterra_jax.host.task_ids import full_id
 from subterra_jax.policies.opening import open_agent
 from subterra_jax.tunnel.sources import load_tunnel
 from train.log import print_table
+from train.tunnels import names_of
 
 _HORIZON = 8000  # steps of a rover, as long as the B2 may take; the task's own end before a slipping rover's arrival
+_UNITS = {"percent": "%", "deg": "deg", "rms": "m", "p95": "m", "mean": "m/s"}
 
 
 @dataclass(frozen=True)
 class Command:
-    """Lets robots with mass traverse a tunnel.
+    """Lets robots do a task, and says how far they got and how their motion differs from that of the plan.
 
-    Example: python -m benchmarks.b2_traverse --robots 100 --agent B2Traverse-v1 --engine mujoco
+    Example: python -m benchmarks.b2_traverse --robot rover --task StopAt-v1 --agent StopAt-v1 --engine mujoco
     """
 
-    robot: Literal["b2", "rover"] = "b2"  # Robot.
+    robot: Literal["wheels", "rover", "b2"] = "b2"  # Robot; `wheels` is that of the plan.
+    task: str = "Traverse-v1"  # Task of wheels and rover.
     robots: int = 100  # Number of robots.
-    seed: int = 0  # Seed for their draws.
-    # Driver: a baseline, a run folder of `train --embodiment b2`, a policy's file or name, or code as `FILE.py:Class`.
+    seed: int = 0  # Seed of the first; the others have those after it.
+    jobs: int = 1  # Processes that share the robots; for `--engine mujoco`.
+    # Driver: a baseline, a run folder of `train`, a policy's file or name, or code as `FILE.py:Class`.
     agent: str = "dead-reckoning"
     policy: str = RELEASED  # Gait: a file, the name of a released gait, or `trot`.
     engine: Literal["mjx", "mujoco"] = "mjx"  # `mjx`, or `mujoco` in C on the host.
-    tunnel: str | None = None  # Tunnel file or name; the packaged tunnel if not given.
+    tunnel: str | None = None  # Tunnels, files or names as `open:val:0-7`; the task's own if not given.
     scene: Path | None = None  # Built scene folder, instead of a tunnel.
     # Length of the tunnel to use, m; 0 is all of it. A policy trained on all of it has never been near a far mouth; for
     # a short trial, lower `coverage` instead.
     length: float = 0.0
-    coverage: float = 0.9  # Share of the tunnel that counts as success.
-    speed: float | None = None  # Largest commanded speed, m/s; that of the robot if not given.
-    out: Path | None = None  # JSON file for the figures.
+    coverage: float | None = None  # Share of the tunnel that counts as success; the task's own if not given.
+    out: Path | None = None  # File for the figures, as records.
 
 
 def show_progress(now: transfer.Walk) -> None:
@@ -59,17 +68,71 @@ def show_progress(now: transfer.Walk) -> None:
 
 
 def _check(arguments: Command) -> None:
-    require_least(arguments, robots=1, seed=0)
-    if not 0.0 < arguments.coverage <= 1.0:
+    require_least(arguments, robots=1, seed=0, jobs=1)
+    if arguments.jobs > 1 and arguments.engine != "mujoco":
+        raise BenchmarkError(f"jobs = {arguments.jobs} is for engine = mujoco")
+    if arguments.coverage is not None and not 0.0 < arguments.coverage <= 1.0:
         raise ValueError(f"coverage must be above 0 and at most 1, got {arguments.coverage}")
-    if arguments.speed is not None and not 0.0 < arguments.speed < math.inf:
-        raise ValueError(f"speed must be above 0, got {arguments.speed}")
     if not 0.0 <= arguments.length < math.inf:
         raise ValueError(f"length must not be negative, got {arguments.length}")
     if arguments.scene is not None and arguments.tunnel is not None:
         raise ValueError(f"either a tunnel or a scene, got both {arguments.tunnel} and {arguments.scene}")
     if arguments.out is not None:
         require_file(arguments.out)
+
+
+def _open(arguments: Command) -> tuple[Any, Any]:
+    """Makes the task for the robot."""
+    tunnel: Any = None if arguments.tunnel is None else names_of(arguments.tunnel)
+    if arguments.length:
+        plans = [load_tunnel(name) for name in tunnel or [None]]
+        tunnel = [plan.slice(0.0, min(arguments.length, plan.length)) for plan in plans]
+    if tunnel is not None and len(tunnel) == 1:
+        tunnel = tunnel[0]
+    options: dict[str, Any] = {"tunnel": tunnel}
+    if arguments.coverage is not None:
+        options["goal_coverage"] = arguments.coverage
+    if arguments.robot != "wheels":
+        options |= {"scene": arguments.scene, "engine": arguments.engine}
+    if arguments.robot == "b2":
+        return tasks.make_mission(policy=arguments.policy, **options)
+    id = full_id(arguments.task.removeprefix("Subterra/").removesuffix("-v1"))
+    if id == "Subterra/Traverse-v1":
+        options["horizon"] = _HORIZON
+    return st.make(id, motion=arguments.robot, **options)
+
+
+def _drive(arguments: Command, share: int = 0) -> tuple[transfer.Walk, transfer.Row, Any]:
+    """Drives the robots of one of the processes."""
+    env, params = _open(arguments)
+    count, levels = params.tunnel.count, np.asarray(env.levels(params))
+    index = np.array_split(np.arange(arguments.robots), arguments.jobs)[share]
+    episodes = Episodes(
+        seed=(arguments.seed + index).astype(np.uint32),
+        tunnel=(index % count).astype(np.int32),
+        severity=levels[index // count % len(levels)].astype(np.int32),
+        group=0 * index,
+    )
+    agent = open_agent(arguments.agent, env, params)
+    watch = show_progress if arguments.jobs == 1 else None
+    return *transfer.walk_robots(env, params, agent, episodes, watch), jax.device_get(params)
+
+
+def _drive_all(arguments: Command) -> tuple[transfer.Walk, transfer.Row, Any]:
+    if arguments.jobs == 1:
+        return _drive(arguments)
+    arguments = dataclasses.replace(arguments, jobs=min(arguments.jobs, arguments.robots))
+    with ProcessPoolExecutor(arguments.jobs, get_context("spawn")) as pool:
+        done = list(pool.map(_drive, [arguments] * arguments.jobs, range(arguments.jobs)))
+    steps = max(rows.lateral.shape[0] for _, rows, _ in done)
+    longer = [jax.tree.map(lambda leaf: _lengthen(leaf, steps), rows) for _, rows, _ in done]
+    rows = jax.tree.map(lambda *parts: np.concatenate(parts, axis=1), *longer)
+    return jax.tree.map(lambda *parts: np.concatenate(parts), *(walk for walk, _, _ in done)), rows, done[0][2]
+
+
+def _lengthen(leaf: np.ndarray, steps: int) -> np.ndarray:
+    """Fills up with NaN, as for robots that are over."""
+    return np.concatenate([leaf, np.full((steps - len(leaf), *leaf.shape[1:]), np.nan, leaf.dtype)])
 
 
 def command(arguments: Command) -> None:
@@ -80,30 +143,46 @@ def command(arguments: Command) -> None:
         SubterraError: Scene, tunnel, agent or gait is missing or wrong, or the output cannot be written.
     """
     _check(arguments)
-    tunnel: Any = arguments.tunnel
-    if arguments.length:
-        plan = load_tunnel(arguments.tunnel)
-        tunnel = plan.slice(0.0, min(arguments.length, plan.length))
-    usual = tasks.VEHICLE if arguments.robot == "b2" else VehicleParams()
-    options: dict[str, Any] = {
-        "tunnel": tunnel,
-        "scene": arguments.scene,
-        "engine": arguments.engine,
-        "goal_coverage": arguments.coverage,
-        "vehicle": usual if arguments.speed is None else replace(usual, speed_max=arguments.speed),
-    }
-    if arguments.robot == "b2":
-        env, params = tasks.make_mission(policy=arguments.policy, **options)
-    else:
-        env, params = st.make("Subterra/Traverse-v1", motion="rover", horizon=_HORIZON, **options)
-    agent, started = open_agent(arguments.agent, env, params), time.perf_counter()
-    walks = transfer.walk_robots(env, params, agent, arguments.robots, arguments.seed, show_progress)
-    figures = transfer.figures(*walks, params)
-    print(file=sys.stderr)
-    figures["wall_seconds"] = time.perf_counter() - started
+    started = time.perf_counter()
+    figures = transfer.figures(*_drive_all(arguments))
+    print(f"\n{time.perf_counter() - started:.0f} s", file=sys.stderr)
     print_table(f"{arguments.robots} of {arguments.robot}, {arguments.engine}, {arguments.agent}", figures)
     if arguments.out is not None:
-        arguments.out.write_text(json.dumps({**vars(arguments), **figures}, default=str, indent=1) + "\n")
+        write_records(arguments.out, records_of(arguments, figures))
+
+
+def records_of(arguments: Command, figures: dict[str, float]) -> list[Record]:
+    """Returns the figures as records `b2/ROBOT/TASK/ENGINE/AGENT/FIGURE`, of wheels without an engine."""
+    n, agent = arguments.robots, Path(arguments.agent).stem
+    task = "B2Traverse-v1" if arguments.robot == "b2" else arguments.task
+    name = "/".join(["b2", arguments.robot, task, *([] if arguments.robot == "wheels" else [arguments.engine]), agent])
+    given = {field.name: getattr(arguments, field.name) for field in dataclasses.fields(arguments)}
+    usual = {field.name: field.default for field in dataclasses.fields(arguments)}
+    changed = {key: value for key, value in given.items() if value != usual[key] and key not in ("out", "jobs")}
+    words = " ".join(f"--{key} {value}" for key, value in changed.items())
+    further = {"n": n, "split": str(arguments.scene or arguments.tunnel or "the task's own tunnels")}
+    records = []
+    for figure, value in figures.items():
+        stem, _, unit = figure.rpartition("_")
+        rate, end = value / 100.0, ("success", "fall", "contact")
+        interval = wilson(rate, n) if stem in end else None
+        records.append(
+            measured(
+                f"{name}/{stem or figure}" if unit in ("percent", "deg") else f"{name}/{figure.replace('_', '-')}",
+                float(f"{value:.3g}"), _UNITS.get(unit, ""), f"benchmarks.b2_traverse {words}",
+                interval=interval, tolerance=100.0 * 1.96 * math.sqrt(0.25 / n) if stem in end else 0.1 * abs(value),
+                **further,
+            )
+        )  # fmt: skip
+    return records
+
+
+def wilson(rate: float, n: int) -> tuple[float, float]:
+    """Returns the 95 % interval of a share of `n`, %, after Wilson."""
+    z = 1.96
+    middle, half = rate + z * z / (2 * n), z * math.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n))
+    low, high = (100.0 * (middle + sign * half) / (1 + z * z / n) for sign in (-1, 1))
+    return round(low, 1), round(high, 1)
 
 
 def main(words: list[str] | None = None) -> int:

@@ -1,4 +1,4 @@
-"""Navigation from wheels to legs: a planar stand-in on which it is cheap to learn, and the trial on many B2s.
+"""Navigation from wheels to legs: a planar stand-in on which it is cheap to learn, and the trial on many robots.
 
 The stand-in obeys late and nods, as the walking robot does.
 """
@@ -11,17 +11,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
-from subterra_jax.baselines.agent import Agent
+from subterra_jax.baselines.agent import Agent, observed
 from subterra_jax.episode import Driver, Episode, Taken
-from subterra_jax.lidar import bearings
+from subterra_jax.evaluation import Episodes
+from subterra_jax.lidar import bearings, scan
 from subterra_jax.parts import Noise, PlanarLidar, SensingState, Unicycle
 from subterra_jax.parts.unicycle import clip_action
+from subterra_jax.physics.riding import mean_motion
+from subterra_jax.physics.rotations import inverse, rotate
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel_env import TunnelEnv
 
 _CHUNK = 25  # steps between two looks at whether any robot is still on its way
+_EVERY = 5  # steps from one that is kept to the next
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,82 +104,122 @@ def stand_in(env: TunnelEnv, lag: Lag = Lag(), nod: Nod = Nod()) -> TunnelEnv:
 
 @struct.dataclass
 class Walk:
-    """Robots on their way."""
+    """Robots at their ends."""
 
     state: State  # state of the environment
     over: Bool[Array, "*n"]  # the robot has arrived or failed
     success: Bool[Array, "*n"]  # the robot has arrived
     contact: Bool[Array, "*n"]  # the robot touched a wall
     fall: Bool[Array, "*n"]  # the robot fell
-    steps: Int[Array, "*n"]  # steps taken
+    begun: Float[Array, "*n"]  # station of its start, m
+
+
+@struct.dataclass
+class Row:
+    """One step of a robot on its way; NaN once it is over."""
+
+    lateral: Float[Array, "*n"]  # lateral offset, m
+    command: Float[Array, "*n 2"]  # speed (m/s) and yaw rate (rad/s) that it was told
+    motion: Float[Array, "*n 2"]  # those that it had
+    lean: Float[Array, "*n 2"]  # pitch and roll against the track, rad; 0 on the plan
+    sway: Float[Array, "*n n_beams"]  # its ranges less those of a level LiDAR without noise, m
 
 
 def walk_robots(
     env: TunnelEnv,
     params: EnvParams,
     agent: Agent,
-    n_robots: int,
-    seed: int = 0,
+    episodes: Episodes,
     watch: Callable[[Walk], None] | None = None,
-) -> tuple[Walk, Float[np.ndarray, "n"]]:
-    """Let robots walk until all have arrived or failed.
+) -> tuple[Walk, Row]:
+    """Let robots drive episodes until all have arrived or failed.
 
     Args:
         agent: The agent that steers.
-        n_robots: Number of robots.
-        seed: Seed of the first; the others have those after it.
+        episodes: An episode for each robot.
         watch: Called now and then with the robots as they are.
 
     Returns:
-        The robots at their ends, and all lateral offsets on the way, m.
+        The robots at their ends; and every `_EVERY`-th step, `(steps, n, ...)`.
     """
-    driver = Driver(env, start=_start, add=_add, keep=_keep)
-    now = driver.begin(params, agent, seed + np.arange(n_robots, dtype=np.uint32))
-    offsets = []
+    driver = Driver(env, start=_start, add=_add, keep=_Keep(env))
+    now = driver.begin(params, agent, episodes.seed, episodes.tunnel, episodes.severity)
+    rows = []
     for last, kept in driver.drive(params, agent, now, _CHUNK):
-        now, lateral = last, np.asarray(kept).ravel()
-        offsets.append(lateral[~np.isnan(lateral)])
+        now = last
+        rows.append(jax.tree.map(lambda leaf: np.asarray(leaf)[::_EVERY], kept))
         if watch is not None:
             watch(_walk(now))
-    return _walk(now), np.concatenate(offsets)
+    return _walk(now), jax.tree.map(lambda *parts: np.concatenate(parts), *rows)
 
 
 def _walk(now: Episode) -> Walk:
-    success, contact, fall = now.tally
-    return jax.device_get(Walk(now.state, now.over, success, contact, fall, now.state.steps))
+    success, contact, fall, begun = now.tally
+    return jax.device_get(Walk(now.state, now.over, success, contact, fall, begun))
 
 
-def _start(state: State, params: EnvParams) -> tuple[Array, Array, Array]:
+def _start(state: State, params: EnvParams) -> tuple[Array, Array, Array, Array]:
     no = jnp.zeros((), bool)
-    return no, no, no
+    return no, no, no, state.station
 
 
-def _add(now: Episode, taken: Taken, params: EnvParams) -> tuple[tuple[Array, Array, Array], Array]:
-    flags = (taken.info["success"], taken.info["contact"], taken.info["fall"])
+def _add(now: Episode, taken: Taken, params: EnvParams) -> tuple[tuple[Array, Array, Array, Array], Array]:
+    fall = taken.info.get("fall", jnp.zeros((), bool))
+    flags = (taken.info["success"], taken.info["contact"], fall, now.tally[3])
     return flags, taken.terminated | taken.truncated
 
 
-def _keep(now: Episode, taken: Taken, params: EnvParams) -> Float[Array, ""]:
-    """Keep the lateral offset, m; NaN once the episode is over."""
-    return jnp.where(now.over, jnp.nan, taken.after.lateral)
+@dataclasses.dataclass(frozen=True)
+class _Keep:
+    env: TunnelEnv
+
+    def __call__(self, now: Episode, taken: Taken, params: EnvParams) -> Row:
+        before, after, motion = taken.before, taken.after, self.env.motion
+        level = scan(params.tunnel, before.position, before.heading, before.station, params.lidar, True)
+        lean = jnp.zeros(2)
+        if not motion.on_the_plan:
+            ride = motion.ride(after.parts[motion.name])
+            up = rotate(inverse(ride.body.qpos[3:7]), rotate(params.track.quaternion[ride.anchor], jnp.eye(3)[2]))
+            lean = jnp.arctan2(jnp.stack([-up[0], up[1]]), up[2])
+        row = Row(
+            lateral=after.lateral,
+            command=after.command,
+            motion=mean_motion(before, after.position, after.heading, params),
+            lean=lean,
+            sway=observed(self.env, params, taken.observation).ranges - level,
+        )
+        return jax.tree.map(lambda leaf: jnp.where(now.over, jnp.nan, leaf), row)
 
 
-def figures(now: Walk, lateral: Float[np.ndarray, "n"], params: EnvParams) -> dict[str, float]:
-    """Compute the figures of a trial: percentages of robots, tunnel and distance, speed (m/s) and offset (m)."""
-    begun, period, length = (float(np.asarray(x)) for x in (
-        params.start.station, params.vehicle.period, params.tunnel.length
-    ))  # fmt: skip
-    walked = np.asarray(now.state.station) - begun
-    error = (np.asarray(now.state.odometry.distance) - walked) / np.maximum(walked, 1.0)
-    share = 100.0 / len(now.over)
+def figures(now: Walk, rows: Row, params: EnvParams) -> dict[str, float]:
+    """Compute the figures of a trial, by name with their units.
+
+    `obeyed` is what a robot does of what it is told, its σ that between robots; `range_off` the spread of ranges about
+    those of a level LiDAR, whose noise is 0.05 m.
+    """
+    period, lengths = float(np.asarray(params.vehicle.period)), np.atleast_1d(np.asarray(params.tunnel.length))
+    state, n = now.state, len(now.over)
+    walked = np.asarray(state.station) - now.begun
+    error = (np.asarray(state.odometry.distance) - np.abs(walked)) / np.maximum(np.abs(walked), 1.0)
+    told, done = (np.nan_to_num(part) for part in (rows.command, rows.motion))
+    obeyed = np.sum(told * done, axis=0) / np.maximum(np.sum(told * told, axis=0), 1e-9)
+    off = np.abs(rows.sway[np.isfinite(rows.sway)])
+    spread = np.rad2deg(np.nanstd(rows.lean, axis=(0, 1)))
     return {
-        "robots": float(len(now.over)),
-        "success_percent": share * float(np.sum(now.success)),
-        "fall_percent": share * float(np.sum(now.fall)),
-        "contact_percent": share * float(np.sum(now.contact)),
-        "coverage_median_percent": 100.0 * float(np.median(now.state.furthest)) / length,
-        "speed_mean": float(np.mean(walked / (np.asarray(now.steps) * period))),
-        "lateral_rms": float(np.sqrt(np.mean(np.square(lateral)))),
+        "robots": float(n),
+        "success_percent": 100.0 * float(np.mean(now.success)),
+        "fall_percent": 100.0 * float(np.mean(now.fall)),
+        "contact_percent": 100.0 * float(np.mean(now.contact)),
+        "coverage_median_percent": 100.0 * float(np.median(state.furthest / lengths[state.tunnel])),
+        "speed_mean": float(np.mean(walked / (np.asarray(state.steps) * period))),
+        "lateral_rms": float(np.sqrt(np.nanmean(np.square(rows.lateral)))),
         "odometer_error_percent": 100.0 * float(np.mean(error)),
         "odometer_error_sigma_percent": 100.0 * float(np.std(error)),
+        "speed_obeyed_percent": 100.0 * float(np.mean(obeyed[:, 0])),
+        "speed_obeyed_sigma_percent": 100.0 * float(np.std(obeyed[:, 0])),
+        "yaw_obeyed_percent": 100.0 * float(np.mean(obeyed[:, 1])),
+        "pitch_sigma_deg": float(spread[0]),
+        "roll_sigma_deg": float(spread[1]),
+        "range_off_rms": float(np.sqrt(np.mean(off**2))),
+        "range_off_p95": float(np.quantile(off, 0.95)),
     }

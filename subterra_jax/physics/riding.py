@@ -132,7 +132,7 @@ class Physical(Unicycle):
         return Moved(
             position=position,
             heading=heading,
-            drive=Drive(wheels, _mean_motion(state, position, heading, params)),
+            drive=Drive(wheels, mean_motion(state, position, heading, params)),
             own=own,
             clearance=clearance,
             contact=contact | outside,
@@ -141,7 +141,7 @@ class Physical(Unicycle):
         )
 
 
-def _mean_motion(
+def mean_motion(
     state: State, position: Float[Array, "2"], heading: Float[Array, ""], params: EnvParams
 ) -> Float[Array, "2"]:
     """Mean speed of the trunk along its mean heading (m/s) and its yaw rate (rad/s) in a step."""
