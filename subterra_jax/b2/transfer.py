@@ -202,7 +202,8 @@ def figures(now: Walk, rows: Row, params: EnvParams) -> dict[str, float]:
     walked = np.asarray(state.station) - now.begun
     error = (np.asarray(state.odometry.distance) - np.abs(walked)) / np.maximum(np.abs(walked), 1.0)
     told, done = (np.nan_to_num(part) for part in (rows.command, rows.motion))
-    obeyed = np.sum(told * done, axis=0) / np.maximum(np.sum(told * told, axis=0), 1e-9)
+    total = np.sum(told * told, axis=0)
+    obeyed = np.where(total > 0.0, np.sum(told * done, axis=0) / np.maximum(total, 1e-9), np.nan)
     off = np.abs(rows.sway[np.isfinite(rows.sway)])
     spread = np.rad2deg(np.nanstd(rows.lean, axis=(0, 1)))
     return {
@@ -215,9 +216,9 @@ def figures(now: Walk, rows: Row, params: EnvParams) -> dict[str, float]:
         "lateral_rms": float(np.sqrt(np.nanmean(np.square(rows.lateral)))),
         "odometer_error_percent": 100.0 * float(np.mean(error)),
         "odometer_error_sigma_percent": 100.0 * float(np.std(error)),
-        "speed_obeyed_percent": 100.0 * float(np.mean(obeyed[:, 0])),
-        "speed_obeyed_sigma_percent": 100.0 * float(np.std(obeyed[:, 0])),
-        "yaw_obeyed_percent": 100.0 * float(np.mean(obeyed[:, 1])),
+        "speed_obeyed_percent": 100.0 * float(np.nanmean(obeyed[:, 0])),
+        "speed_obeyed_sigma_percent": 100.0 * float(np.nanstd(obeyed[:, 0])),
+        "yaw_obeyed_percent": 100.0 * float(np.nanmean(obeyed[:, 1])),
         "pitch_sigma_deg": float(spread[0]),
         "roll_sigma_deg": float(spread[1]),
         "range_off_rms": float(np.sqrt(np.mean(off**2))),
