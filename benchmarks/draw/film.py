@@ -1,14 +1,16 @@
 """Films an episode: what the LiDAR sees, and where truth, odometer and agent have the robot.
 
-`python -m benchmarks.draw film --agent locate-transformer --task StopAt-v1 --out out/film.webp`
+`python -m benchmarks.draw film --agent locate-transformer --task StopAt-v1 --out out/film.webp`; a rover, with
+`--motion rover` and `--scene DIR`, is seen from behind as well.
 """
 
 import io
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+import jax
 import matplotlib.pyplot as plt
 import numpy as np
 from jaxtyping import Float
@@ -24,14 +26,19 @@ from benchmarks.results import write_file
 from subterra_jax import policies
 from subterra_jax.host.files import require_file
 from subterra_jax.parts.spatial_lidar import SENSORS
+from subterra_jax.pictures.camera import TunnelChoice
+from subterra_jax.pictures.renderer import PictureError
 from subterra_jax.recorder.trace import drive
-from subterra_jax.tasks import TASKS, find, first_tunnel, is_planar
+from subterra_jax.tasks import MOTIONS, TASKS, find, first_tunnel, is_planar
+from subterra_jax.tunnel.sources import tunnel_of
 from subterra_jax.viewer.episode import Drawn, draw
 
 _AHEAD, _ASIDE = 20.0, 4.5  # half sides of what the plan shows, m
 _PICTURE = 80  # time of a picture on screen, ms
 _LAST = 1500  # time of the last picture, ms
 _FEW = 64  # beams that are drawn as lines; of more their ends are
+_VIEW = (760, 340)  # pixels of the view from behind
+View = Callable[[int], np.ndarray]
 _WALL, _BEAM, _TRUTH, _ODOMETER, _AGENT = "#222222", "#e09f3e", "#1b4965", "#c1121f", "#2a9d8f"
 
 
@@ -46,6 +53,8 @@ class FilmConfig:
     task: str = "Subterra/StopAt-v1"  # Task.
     tunnel: str | None = None  # Tunnel: a name, a file, `open:SPLIT:INDEX`; the task's default if not given.
     agent: str = "locate-transformer"  # Who drives: a written agent, a released policy or a policy's file.
+    motion: Literal["wheels", "rover"] = "wheels"  # What moves the robot; `rover`: physics, in MuJoCo's own engine.
+    scene: Path | None = None  # Built scene folder in which the rover drives.
     sensor: str = SENSORS[0]  # LiDAR.
     seed: int = 0  # Seed of the episode.
     pictures: int = 110  # Number of pictures.
@@ -66,27 +75,54 @@ def run(config: FilmConfig) -> None:
     if not 2 <= config.pictures <= 1000:
         raise BenchmarkError(f"pictures must be 2 to 1000, got {config.pictures}")
     require_file(config.out, ".webp")
-    drawn, radius = drive_episode(config)
+    drawn, radius, view = drive_episode(config)
     name = "a trained policy" if Path(config.agent).exists() else config.agent
     write_file(
         config.out,
-        film(drawn, radius, f"{find(config.task, short=True).split('/')[-1]}, driven by {name}", config.pictures),
+        film(drawn, radius, f"{find(config.task, short=True).split('/')[-1]}, driven by {name}", config.pictures, view),
     )
     print(f"{config.out}: {drawn.trace.time[-1]:.0f} s of driving, {_end(drawn)}")
 
 
-def drive_episode(config: FilmConfig) -> tuple[Drawn, float]:
-    """Drives the episode of the settings; returns it and the radius of the robot, m."""
+def drive_episode(config: FilmConfig) -> tuple[Drawn, float, View | None]:
+    """Drives the episode of the settings; returns it, the radius of the robot (m) and what draws a rover, or None."""
     spatial = not is_planar(config.sensor)
-    plan = st.load_tunnel(config.tunnel or first_tunnel(find(config.task, short=True), spatial), solid=spatial)
-    env, params = st.make(config.task, tunnel=plan, sensor=config.sensor)
+    if config.scene is not None and (config.motion == MOTIONS[0] or config.tunnel is not None):
+        raise BenchmarkError(f"scene = {config.scene} is for motion = rover, and brings its own tunnel")
+    source = config.tunnel or first_tunnel(find(config.task, short=True), spatial)
+    plan = st.load_tunnel(source if config.scene is None else tunnel_of(config.scene), solid=spatial)
+    rides: dict[str, Any] = {}
+    if config.motion != MOTIONS[0]:
+        rides = {"motion": config.motion, "engine": "mujoco", "scene": config.scene}
+    env, params = st.make(config.task, tunnel=plan, sensor=config.sensor, **rides)
     agent = policies.open_agent(config.agent, env, params)
     if piece := TASKS[env.id].piece:
         plan = plan.slice(piece[0], min(piece[1], plan.length - piece[0]))
-    return draw(env, params, plan, drive(env, params, agent, config.seed)), float(params.vehicle.radius)
+    drawn = draw(env, params, plan, drive(env, params, agent, config.seed))
+    return drawn, float(params.vehicle.radius), _view(config, env, params, drawn) if rides else None
 
 
-def film(drawn: Drawn, radius: float, title: str, pictures: int) -> bytes:
+def _view(config: FilmConfig, env: Any, params: Any, drawn: Drawn) -> View | None:
+    """Returns what draws a row of an episode from behind; None, with a word about it, where there is no OpenGL."""
+    from subterra_jax.physics.stage import scene_file  # MuJoCo is loaded only where physics is meant
+    from subterra_jax.physics.view import RobotView
+
+    file = None if config.scene is None else scene_file(config.scene, None)
+    choice = TunnelChoice(config.tunnel, piece=TASKS[env.id].piece)
+    camera = RobotView(env.motion.engine, params.track, choice, file, *_VIEW)
+
+    def view(row: int) -> np.ndarray:
+        return camera.picture(env, params, jax.tree.map(lambda leaf: leaf[row], drawn.trace.state), np.zeros(0))
+
+    try:
+        view(0)
+    except PictureError as error:
+        print(f"without a view from behind: {error}")
+        return None
+    return view
+
+
+def film(drawn: Drawn, radius: float, title: str, pictures: int, view: View | None = None) -> bytes:
     """Draws an episode as an animated WebP.
 
     Args:
@@ -94,8 +130,9 @@ def film(drawn: Drawn, radius: float, title: str, pictures: int) -> bytes:
         radius: Radius of the robot, m.
         title: What stands above it.
         pictures: Number of pictures, evenly spread in time.
+        view: Draws the robot from behind above the plan; None for one without a body.
     """
-    frames = [Image.fromarray(picture) for picture in _pictures(drawn, radius, title, pictures)]
+    frames = [Image.fromarray(picture) for picture in _pictures(drawn, radius, title, pictures, view)]
     shown = [_PICTURE] * (len(frames) - 1) + [_LAST]
     buffer = io.BytesIO()
     frames[0].save(
@@ -108,15 +145,21 @@ def _end(drawn: Drawn) -> str:
     return "success" if drawn.trace.success else "contact" if drawn.trace.contact else "no success"
 
 
-def _pictures(drawn: Drawn, radius: float, title: str, count: int) -> Iterator[np.ndarray]:
-    figure, (plan, strip) = plt.subplots(
-        2, 1, figsize=(9.6, 4.6), dpi=84, height_ratios=(1.55, 1.0), layout="constrained"
+def _pictures(drawn: Drawn, radius: float, title: str, count: int, view: View | None) -> Iterator[np.ndarray]:
+    heights, size = ((1.55, 1.0), 4.6) if view is None else ((3.6, 1.55, 1.0), 8.6)
+    figure, (*above, plan, strip) = plt.subplots(
+        len(heights), 1, figsize=(9.6, size), dpi=84, height_ratios=heights, layout="constrained"
     )
     figure.suptitle(title, fontsize=11)
     draw_plan, draw_strip = _plan(plan, drawn, radius), _strip(strip, drawn)
+    behind = [axes.imshow(np.zeros((_VIEW[1], _VIEW[0], 3), np.uint8), aspect="equal") for axes in above]
+    for axes in above:
+        axes.axis("off")
     for row in np.unique(np.linspace(0, len(drawn) - 1, count).astype(int)):
         draw_plan(row)
         draw_strip(row)
+        for image in behind:
+            image.set_data(view(row))
         figure.canvas.draw()
         yield np.asarray(figure.canvas.buffer_rgba())[..., :3].copy()  # type: ignore[attr-defined]
     plt.close(figure)
