@@ -40,7 +40,10 @@ def scene_model(case: Case) -> mujoco.MjModel:
 
 @lru_cache(maxsize=1)  # null tube, truth and most controls have the scene of the reconstruction
 def _compile_scene(scene: Path, changed: int) -> mujoco.MjModel:
-    return load_model(scene)
+    model = load_model(scene)
+    # Rays leave out one body at most, and a robot has wheels too.
+    model.geom_group[np.isin(model.body_rootid[model.geom_bodyid], model.jnt_bodyid)] = _HIDDEN
+    return model
 
 
 @per_case
@@ -89,6 +92,7 @@ def random_stations(case: Case, id: str, count: int, inset: float = 1.0) -> tupl
 
 LINING_NAMES = ("lining", "recess", "floor")  # what pieces of the lining are called
 VISIBLE_GROUPS = np.array([1, 1, 1, 0, 0, 0], np.uint8)  # groups that a camera draws
+_HIDDEN = 5  # group of what moves, where no ray sees it
 _MESH_NAMES = {"bed", *LINING_NAMES, "sleeper", "rail", "fastening", "fastenings"}  # geoms of lining and track
 _EYES = 100
 _RAYS_PER_EYE = 1000
@@ -127,15 +131,11 @@ def scene_ranges(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return ranges by `mj_multiRay` in drawn geoms without the robot, m, `inf` for none, and the geoms hit."""
     data = placed_data(model)
-    try:
-        robot = robot_body(model)
-    except ValueError:
-        robot = -1
     count = way.shape[1]
     reach, geom = np.empty((len(eye), count)), np.empty((len(eye), count), np.int32)
     for row in range(len(eye)):
         mujoco.mj_multiRay(
-            model, data, eye[row], np.ascontiguousarray(way[row]).ravel(), VISIBLE_GROUPS, True, robot, geom[row],
+            model, data, eye[row], np.ascontiguousarray(way[row]).ravel(), VISIBLE_GROUPS, True, -1, geom[row],
             reach[row], None, count, mujoco.mjMAXVAL,
         )  # fmt: skip
     return np.where(reach < 0.0, np.inf, reach).ravel(), geom.ravel()

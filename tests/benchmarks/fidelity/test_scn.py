@@ -2,11 +2,13 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from benchmarks.fidelity import table
 from benchmarks.fidelity.candidate import load_candidate
 from benchmarks.fidelity.case import Case
+from benchmarks.fidelity.derive.scene import rays_from_axis
 from tests.benchmarks.fidelity import tubescene
 from tests.benchmarks.fidelity.judged import measure
 from tests.benchmarks.fidelity.tube import Tube
@@ -37,6 +39,15 @@ def rewritten(good, tmp_path):
 def test_a_sound_scene_scores_full_marks(good, id):
     value = measure(id, good)
     assert table.load()[id].map.score(value.value) == 100.0, value
+
+
+def test_rays_see_nothing_of_a_robot_with_wheels(good, rewritten):
+    wheel = '<body name="wheel" pos="0 0.5 0"><joint/><geom type="sphere" size="0.4" mass="1" contype="0"/></body>'
+    wheeled = rewritten('conaffinity="3"/></body>', f'conaffinity="3"/>{wheel}</body>')
+    for id in ("mj_ray_vs_mesh_mae", "mj_probe_free_frac", "mj_wall_contact_err"):
+        assert measure(id, wheeled).value == measure(id, good).value
+    seen = [rays_from_axis(case).scene for case in (wheeled, good)]
+    np.testing.assert_array_equal(*seen)
 
 
 def test_the_step_rate_is_measured(good):
