@@ -19,7 +19,7 @@ from subterra_jax.policies.loading import load
 from subterra_jax.policies.opening import open_agent, policy_source, require_known
 from subterra_jax.rows import for_some
 from subterra_jax.state import EnvParams
-from subterra_jax.tasks import make
+from subterra_jax.tasks import MOTIONS, make
 from subterra_jax.tunnel_env import TunnelEnv
 
 Memory = Any
@@ -207,8 +207,9 @@ def load_policy(source: Any, env: TunnelEnv | None = None, params: EnvParams | N
             name = source if isinstance(source, str) else getattr(source, "name", type(source).__name__)
             raise PolicyError(f"{name}: drives any task, so name one: load_policy({name!r}, env, params)")
         walks = facts.get("world", {}).get("embodiment") == "b2"
-        sensor = facts.get("world", {}).get("sensor", SENSORS[0])
-        env, params = make(MISSIONS[0]) if walks else make(facts["task"], sensor=sensor)
+        world = {"sensor": SENSORS[0], "motion": MOTIONS[0], **facts.get("world", {})}
+        asked = {name: world[name] for name in ("sensor", "motion")}
+        env, params = make(MISSIONS[0]) if walks else make(facts["task"], **asked)
     return DrivingPolicy(open_agent(source, env, params), params, env)
 
 

@@ -2,17 +2,18 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import subterra_jax as st
 from subterra_jax import policies
 from subterra_jax.baselines.agent import Agent
 from subterra_jax.evaluation import listed_episodes
+from subterra_jax.host import rover
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.host.files import require_folder
 from subterra_jax.parts.spatial_lidar import SENSORS
 from subterra_jax.state import EnvParams
-from subterra_jax.tasks import TASKS, find, first_tunnel
+from subterra_jax.tasks import MOTIONS, TASKS, find, first_tunnel
 from subterra_jax.tunnel.plan import TunnelPlan
 from subterra_jax.tunnel_env import TunnelEnv
 
@@ -36,6 +37,7 @@ class RecorderConfig:
         episode: Record this one of the task's 500 listed episodes instead (from 0), as the leaderboard drives it.
         tunnel: Tunnel file or name; the first of those that the task has by itself if left out.
         lining: Variant of the walls; `pockets` if left out.
+        motion: `wheels`; or `rover`, by physics in MuJoCo's own engine, whose truth pitches and rolls.
         sensor: The robot's own LiDAR: `planar16`, or `spin16x64`, `vlp16`, `os1-64`, `avia` in three dimensions, whose
             returns are recorded as `/points` in place of `/scan`.
         every: Steps from one `/points` to the next.
@@ -51,6 +53,7 @@ class RecorderConfig:
     episode: int | None = None
     tunnel: str | None = None
     lining: str | None = None
+    motion: Literal["wheels", "rover"] = "wheels"
     sensor: SensorName = "planar16"
     every: int = 1
     imu: bool = False
@@ -112,8 +115,15 @@ class World:
         return "scan" in self.env.fields(self.params)
 
     @property
+    def track(self) -> Any:
+        """Ground of a robot by physics; None on the plan."""
+        return None if self.env.motion.on_the_plan else self.params.track
+
+    @property
     def sensor_height(self) -> float:
         """Height of LiDAR and IMU over the ground, m."""
+        if not self.env.motion.on_the_plan:
+            return rover.LIDAR_HEIGHT
         return float(self.params.lidar.mount.height) if self.is_spatial else self.plan.lidar_height
 
 
@@ -130,7 +140,8 @@ def open_world(config: RecorderConfig) -> World:
     spatial = config.sensor != SENSORS[0]
     plan = st.load_tunnel(config.tunnel or first_tunnel(name, spatial), solid=spatial)
     try:
-        env, params = st.make(name, plan, config.lining, sensor=config.sensor)
+        physics = {} if config.motion == MOTIONS[0] else {"engine": "mujoco"}
+        env, params = st.make(name, plan, config.lining, sensor=config.sensor, motion=config.motion, **physics)
     except ValueError as error:
         raise RecorderError(str(error)) from error
     piece = TASKS[name].piece

@@ -192,7 +192,7 @@ def _write_recording(folder: Path, config: RecorderConfig, trace: Trace, world: 
     parts, range_max = world.env.fields(world.params), float(world.params.lidar.range_max)
     height = world.sensor_height
     reckoned = reckoned_poses(trace, trace.observation[:, parts["odometry"]])
-    sensor = true_poses(trace, world.plan).lift(height)
+    sensor = true_poses(trace, world.plan, world.track).lift(height)
     mounted = {"laser": not world.is_spatial, "lidar": world.is_spatial, "imu": config.imu}
     streams: list[Iterator[Message]] = [
         _mounts(height, tuple(frame for frame, there in mounted.items() if there)),
@@ -215,7 +215,7 @@ def _write_truth(
     folder: Path, recording: Path, config: RecorderConfig, trace: Trace, world: World, outcome: dict[str, Any]
 ) -> None:
     """Write the messages and facts that the robot does not know."""
-    body = true_poses(trace, world.plan)
+    body = true_poses(trace, world.plan, world.track)
     streams: list[Iterator[Message]] = [_frames(body, "map"), _odometry("/truth/odometry", body, "map")]
     topics = write_bag(folder, _merge(streams))
     _save_tum(folder / "lidar.tum", body.lift(world.sensor_height))

@@ -5,12 +5,14 @@ left, z square to the track; `odom` is `base_link` at the start. Both LiDARs and
 """
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
+from subterra_jax.host import rover
 from subterra_jax.recorder.trace import Trace, reckon
 from subterra_jax.tunnel.plan import TunnelPlan
 
@@ -31,9 +33,18 @@ class Poses:
         return dataclasses.replace(self, position=self.position + self.rotation.apply([0.0, 0.0, height]))
 
 
-def true_poses(trace: Trace, plan: TunnelPlan) -> Poses:
-    """Return the poses of `base_link` in the tunnel frame: on the track, pitched by its grade, never rolled."""
+def true_poses(trace: Trace, plan: TunnelPlan, track: Any = None) -> Poses:
+    """Return the poses of `base_link` in the tunnel frame: on the track, pitched by its grade, never rolled.
+
+    Args:
+        track: Ground of a robot by physics, on which it leans as it drives; None for one on the plan.
+    """
     state = trace.state
+    if track is not None:
+        ride = state.parts["rover"]
+        turn = Rotation.from_quat(np.asarray(ride.body.qpos, np.float64)[:, [4, 5, 6, 3]])
+        middle = np.asarray(track.position, np.float64)[ride.anchor] + np.asarray(ride.body.qpos, np.float64)[:, :3]
+        return Poses(trace.time, middle - rover.HEIGHT * turn.as_matrix()[:, :, 2], turn)
     station = np.asarray(state.station, np.float64)
     tangent = np.stack([np.interp(station, plan.station, plan.tangent[:, i]) for i in range(2)], axis=-1)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)

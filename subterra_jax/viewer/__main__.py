@@ -31,6 +31,7 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     add("--tunnel", metavar="NAME|FILE", help="tunnel; the first of the task's own if left out")
     add("--scene", type=Path, metavar="DIR", help="scene folder of scene.build, whose tunnel is driven")
     add("--lining", metavar="NAME", help="pockets, smooth or furnished")
+    add("--motion", default="wheels", metavar="NAME", help="wheels (default), or rover: by physics, in MuJoCo")
     add("--sensor", default="planar16", metavar="NAME", help="planar16 (default), spin16x64, vlp16, os1-64 or avia")
     add("--seed", type=int, default=0, metavar="N", help="seed of the episode")
     add("--steps", type=int, metavar="N", help="steps at most; the task's horizon if left out")
@@ -60,7 +61,7 @@ def view(settings: argparse.Namespace) -> None:
     from subterra_jax.parts.spatial_lidar import SENSORS
     from subterra_jax.policies import open_agent
     from subterra_jax.recorder.trace import drive
-    from subterra_jax.tasks import TASKS, find, first_tunnel, is_planar
+    from subterra_jax.tasks import MOTIONS, TASKS, find, first_tunnel, is_planar
     from subterra_jax.tunnel.sources import tunnel_of
     from subterra_jax.viewer.episode import draw
     from subterra_jax.viewer.shapes import planar_shapes
@@ -80,8 +81,12 @@ def view(settings: argparse.Namespace) -> None:
         raise SubterraError(f"{settings.scene}: no such scene folder")
     source = settings.tunnel or first_tunnel(task, not is_planar(sensor))
     plan = st.load_tunnel(source if settings.scene is None else tunnel_of(settings.scene), solid=not is_planar(sensor))
-    legs: dict[str, Any] = {"engine": "mujoco"} if task in MISSIONS else {}
-    env, params = st.make(task, tunnel=plan, lining=settings.lining, sensor=sensor, **legs)
+    physics: dict[str, Any] = {} if settings.motion == MOTIONS[0] else {"motion": settings.motion, "engine": "mujoco"}
+    if task in MISSIONS:
+        physics["engine"] = "mujoco"
+    if physics and settings.scene is not None:
+        physics["scene"] = settings.scene
+    env, params = st.make(task, tunnel=plan, lining=settings.lining, sensor=sensor, **physics)
     agent = open_agent(settings.driver, env, params)
     piece = TASKS[task].piece if task in TASKS else None
     shown = plan if piece is None else plan.slice(piece[0], min(piece[1], plan.length - piece[0]))
