@@ -1,6 +1,5 @@
 """The documentation runs as printed, and its site is built without a warning and without the net."""
 
-import argparse
 import json
 import os
 import re
@@ -152,8 +151,6 @@ def command_line() -> Callable[[list[str]], None]:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(sys, "argv", words)
             readers: list[tuple[Any, str]] = [(tyro, "cli"), (tyro.extras, "subcommand_cli_from_dict")]
-            if words[0] == "subterra_jax.b2.film":
-                readers = [(argparse.ArgumentParser, "parse_args")]
             for room, name in readers:
                 patch.setattr(room, name, _stopping(getattr(room, name)))
             with pytest.raises(_Read):

@@ -66,9 +66,7 @@ MISTAKES = {
     "train --out o --frames 8": "frames = 8 is for memory = stack or along, and memory = none does not read it",
     "train --out o --memory stack --cell 8": "cell = 8 is for memory = gru, and memory = stack does not read it",
     "train --out o --memory along --map --front wide": "map = True is for front = match, and front = wide",
-    "train --out o --legs.robots 3": "legs are for embodiment = b2, and embodiment = scout drives on wheels",
-    "train --out o --embodiment b2 --sensor vlp16": "sensor = vlp16 is for embodiment = scout; with b2 it is planar16",
-    "train --out o --embodiment b2 --val control": "val = control is for embodiment = scout; with b2 it is None",
+    "train --out o --motion b2 --sensor vlp16": "sensor = vlp16 is not for motion = b2; with it, it is planar16",
     "train --out o --begin-from locate-transformer": "begin_from = locate-transformer: a localiser, and memory = none",
     "train --out o --begin-from TraverseShort-v1 --hidden 7": "begin_from = TraverseShort-v1 has another network:",
     "train --out o --begin-from nobody": "begin_from = nobody: nobody: no such policy",
@@ -181,11 +179,6 @@ MISTAKES = {
     "subterra_jax.recorder --out o --episode 500": "500",
     "subterra_jax.recorder --out text.txt/x": "text.txt: is a file",
     "subterra_jax.recorder --out o --truth text.txt": "text.txt: exists already",
-    "subterra_jax.b2.film": "arguments are required: out",
-    "subterra_jax.b2.film o.webp --seconds nan": "seconds must be above 0",
-    "subterra_jax.b2.film o.webp --width -4": "width must be 16 to",
-    "subterra_jax.b2.film o.xyz": "o.xyz: must end in .gif or .webp or .mp4",
-    "subterra_jax.b2.film o.webp --scene none": "none",
 }
 COMMANDS = sorted({words.split()[0] for words in MISTAKES} - {"benchmarks.fidelity", "benchmarks.slam"}) + [
     f"benchmarks.fidelity{part}"

@@ -16,7 +16,7 @@ import tyro
 
 from subterra_jax.host.command import EXIT_INTERRUPTED, parse, run_command
 from train import clock
-from train.config import ConfigError, Legs, TrainConfig, check, make_config
+from train.config import ConfigError, TrainConfig, check, make_config
 from train.evaluate import check_episodes
 from train.options import insert_file, reward_of, settings_of, with_weights
 from train.session import Session, check_seeds, run_seeds
@@ -57,10 +57,8 @@ class Command:
     resume: bool = False  # go on from the newest checkpoint, or from the beginning
     overwrite: bool = False  # throw away the run that `out` holds
     evaluation_episodes: int = 200  # episodes of the evaluation after training, of 500; 0 leaves it out
-    embodiment: Literal["scout", "b2"] = "scout"  # `scout`, the tasks' robot; or `b2`, tried on four legs afterwards
     # YAML, TOML or JSON file with options, or a run's `config.json`; options override it
     settings: Annotated[Path | None, tyro.conf.arg(name="config")] = None
-    legs: Legs = dataclasses.field(default_factory=Legs)  # the trial of `--embodiment b2`
     # further places to log to
     logs: Annotated[Logs, tyro.conf.OmitArgPrefixes] = dataclasses.field(default_factory=Logs)
     # settings of PPO
@@ -117,9 +115,7 @@ def command(arguments: Command) -> int:
 
 def _world(arguments: Command) -> World:
     """Opens the task for the robot that is to do it."""
-    if arguments.embodiment == "scout":
-        if arguments.legs != Legs():
-            raise ConfigError("legs are for embodiment = b2, and embodiment = scout drives on wheels")
+    if arguments.motion != "b2":
         return open_world(
             arguments.task,
             arguments.tunnel,
@@ -132,13 +128,12 @@ def _world(arguments: Command) -> World:
             arguments.texture,
             arguments.motion,
         )
-    usual_of = {"sensor": "planar16", "intensity": False, "hidden_start": False, "val": None, "motion": "wheels"}
-    for name, usual in usual_of.items():
+    for name, usual in (("sensor", "planar16"), ("intensity", False), ("hidden_start", False), ("val", None)):
         if (given := getattr(arguments, name)) != usual:
-            raise ConfigError(f"{name} = {given} is for embodiment = scout; with b2 it is {usual}")
+            raise ConfigError(f"{name} = {given} is not for motion = b2; with it, it is {usual}")
     from train.b2 import embodied  # MuJoCo is loaded only where legs are meant
 
-    return embodied.open_world(arguments.task, arguments.tunnel, arguments.lining, arguments.legs)
+    return embodied.open_world(arguments.task, arguments.tunnel, arguments.lining)
 
 
 def _one(arguments: Command, world: World) -> int:
@@ -151,10 +146,6 @@ def _one(arguments: Command, world: World) -> int:
     if arguments.evaluation_episodes:
         session.score(last, arguments.evaluation_episodes)
         clock.lap("evaluate")
-    if arguments.embodiment == "b2" and arguments.legs.robots:
-        from train.b2 import embodied
-
-        embodied.score(session, last, arguments.tunnel, arguments.legs)
     _report(last, time.perf_counter() - started)
     return 0
 

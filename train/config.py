@@ -4,7 +4,6 @@ import dataclasses
 import math
 from typing import Any, ClassVar, Literal
 
-from subterra_jax.b2.gait import RELEASED
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.policies.memories import MEMORIES
 from subterra_jax.tasks import TASKS
@@ -244,12 +243,3 @@ def check(config: TrainConfig) -> TrainConfig:
     positive(config, *(name for name in ("init_turn", "last_std", "cruise") if getattr(config, name) is not None))
     share(config, "discount", "gae_lambda", "last_rate")
     return config
-
-
-@dataclasses.dataclass(frozen=True)
-class Legs:
-    """The trial on four legs after training."""
-
-    gait: str = RELEASED  # A file, the name of a released gait, or `trot`
-    robots: int = 100  # number of robots; 0 leaves the trial out
-    engine: Literal["mjx", "mujoco"] = "mjx"  # `mjx`, or `mujoco` in C on the host

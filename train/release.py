@@ -17,7 +17,7 @@ from subterra_jax.host.files import require_file
 from subterra_jax.policies import TRAINED_UNDER, Conditions
 from subterra_jax.policies.files import TENSORS
 from subterra_jax.policies.learnt import Learnt
-from train.config import ConfigError, Legs
+from train.config import ConfigError
 from train.evaluate import evaluate
 from train.log import print_table
 from train.policies import write_tensors
@@ -61,11 +61,11 @@ def command(arguments: Command) -> None:
 
 def _world(stored: dict[str, Any], arguments: Command) -> World:
     """Opens the world to score in: of the robot that was trained, or of the stand-in of one on legs."""
-    if stored["world"].get("embodiment") is None:
+    if stored["world"].get("motion") != "b2":
         return open_world(stored["task"], arguments.tunnel, arguments.lining, **lidar_of(stored["world"]))
     from train.b2 import embodied  # MuJoCo is loaded only where legs are meant
 
-    return embodied.open_world(stored["task"], arguments.tunnel, arguments.lining, Legs(robots=0))
+    return embodied.open_world(stored["task"], arguments.tunnel, arguments.lining)
 
 
 def main() -> None:

@@ -1,7 +1,7 @@
 """Films an episode: what the LiDAR sees, and where truth, odometer and agent have the robot.
 
-`python -m benchmarks.draw film --agent locate-transformer --task StopAt-v1 --out out/film.webp`; a rover, with
-`--motion rover` and `--scene DIR`, is seen from behind as well.
+`python -m benchmarks.draw film --agent locate-transformer --task StopAt --out out/film.webp`; a rover, with `--motion
+rover`, and a B2, with `--task B2Traverse`, are seen from behind as well, in the scene of `--scene DIR`.
 """
 
 import io
@@ -25,6 +25,7 @@ from benchmarks.command import BenchmarkError, run_main
 from benchmarks.results import write_file
 from subterra_jax import policies
 from subterra_jax.host.files import require_file
+from subterra_jax.host.task_ids import MISSIONS
 from subterra_jax.parts.spatial_lidar import SENSORS
 from subterra_jax.pictures.camera import TunnelChoice
 from subterra_jax.pictures.renderer import PictureError
@@ -54,7 +55,8 @@ class FilmConfig:
     tunnel: str | None = None  # Tunnel: a name, a file, `open:SPLIT:INDEX`; the task's default if not given.
     agent: str = "locate-transformer"  # Who drives: a written agent, a released policy or a policy's file.
     motion: Literal["wheels", "rover"] = "wheels"  # What moves the robot; `rover`: physics, in MuJoCo's own engine.
-    scene: Path | None = None  # Built scene folder in which the rover drives.
+    scene: Path | None = None  # Built scene folder in which a rover or a B2 moves.
+    steps: int | None = None  # Steps at most; the task's horizon if not given.
     sensor: str = SENSORS[0]  # LiDAR.
     seed: int = 0  # Seed of the episode.
     pictures: int = 110  # Number of pictures.
@@ -87,29 +89,31 @@ def run(config: FilmConfig) -> None:
 def drive_episode(config: FilmConfig) -> tuple[Drawn, float, View | None]:
     """Drives the episode of the settings; returns it, the radius of the robot (m) and what draws a rover, or None."""
     spatial = not is_planar(config.sensor)
-    if config.scene is not None and (config.motion == MOTIONS[0] or config.tunnel is not None):
-        raise BenchmarkError(f"scene = {config.scene} is for motion = rover, and brings its own tunnel")
-    source = config.tunnel or first_tunnel(find(config.task, short=True), spatial)
+    id = find(config.task, short=True)
+    physics: dict[str, Any] = {} if config.motion == MOTIONS[0] else {"motion": config.motion}
+    if physics or id in MISSIONS:
+        physics |= {"engine": "mujoco", "scene": config.scene}
+    if config.scene is not None and (not physics or config.tunnel is not None):
+        raise BenchmarkError(f"scene = {config.scene} is for a robot by physics, and brings its own tunnel")
+    source = config.tunnel or first_tunnel(id, spatial)
     plan = st.load_tunnel(source if config.scene is None else tunnel_of(config.scene), solid=spatial)
-    rides: dict[str, Any] = {}
-    if config.motion != MOTIONS[0]:
-        rides = {"motion": config.motion, "engine": "mujoco", "scene": config.scene}
-    env, params = st.make(config.task, tunnel=plan, sensor=config.sensor, **rides)
+    env, params = st.make(id, tunnel=plan, sensor=config.sensor, **physics)
     agent = policies.open_agent(config.agent, env, params)
-    if piece := TASKS[env.id].piece:
+    if piece := TASKS[id].piece if id in TASKS else None:
         plan = plan.slice(piece[0], min(piece[1], plan.length - piece[0]))
-    drawn = draw(env, params, plan, drive(env, params, agent, config.seed))
-    return drawn, float(params.vehicle.radius), _view(config, env, params, drawn) if rides else None
+    drawn = draw(env, params, plan, drive(env, params, agent, config.seed, steps=config.steps))
+    return drawn, float(params.vehicle.radius), _view(config, env, params, drawn, piece) if physics else None
 
 
-def _view(config: FilmConfig, env: Any, params: Any, drawn: Drawn) -> View | None:
+def _view(config: FilmConfig, env: Any, params: Any, drawn: Drawn, piece: Any) -> View | None:
     """Returns what draws a row of an episode from behind; None, with a word about it, where there is no OpenGL."""
     from subterra_jax.physics.stage import scene_file  # MuJoCo is loaded only where physics is meant
     from subterra_jax.physics.view import RobotView
 
     file = None if config.scene is None else scene_file(config.scene, None)
-    choice = TunnelChoice(config.tunnel, piece=TASKS[env.id].piece)
-    camera = RobotView(env.motion.engine, params.track, choice, file, *_VIEW)
+    choice = TunnelChoice(config.tunnel, piece=piece)
+    engine = env.motion.walk.physics if env.id in MISSIONS else env.motion.engine
+    camera = RobotView(engine, params.track, choice, file, *_VIEW)
 
     def view(row: int) -> np.ndarray:
         return camera.picture(env, params, jax.tree.map(lambda leaf: leaf[row], drawn.trace.state), np.zeros(0))

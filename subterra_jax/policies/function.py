@@ -206,7 +206,7 @@ def load_policy(source: Any, env: TunnelEnv | None = None, params: EnvParams | N
                 require_known(str(source))
             name = source if isinstance(source, str) else getattr(source, "name", type(source).__name__)
             raise PolicyError(f"{name}: drives any task, so name one: load_policy({name!r}, env, params)")
-        walks = facts.get("world", {}).get("embodiment") == "b2"
+        walks = facts.get("world", {}).get("motion") == "b2"
         world = {"sensor": SENSORS[0], "motion": MOTIONS[0], **facts.get("world", {})}
         asked = {name: world[name] for name in ("sensor", "motion")}
         env, params = make(MISSIONS[0]) if walks else make(facts["task"], **asked)

@@ -1,4 +1,4 @@
-"""What is made of many robots' walks, and of one that is filmed."""
+"""What is made of many robots' walks."""
 
 from types import SimpleNamespace
 
@@ -7,9 +7,8 @@ import pytest
 
 import subterra_jax as st
 from benchmarks import b2_traverse
-from subterra_jax.b2 import film, transfer
+from subterra_jax.b2 import transfer
 from subterra_jax.evaluation import listed_episodes
-from subterra_jax.pictures.renderer import PictureError
 from tests.subterra_jax import probes
 
 PARAMS = SimpleNamespace(vehicle=SimpleNamespace(period=0.2), tunnel=SimpleNamespace(length=np.array(100.0)))
@@ -49,20 +48,6 @@ def test_figures_of_four_robots_are_what_one_counts_by_hand():
     assert told["odometer_error_sigma_percent"] == pytest.approx(100.0 * np.sqrt(2 * 0.05**2 / 4))
     assert (told["speed_obeyed_percent"], told["yaw_obeyed_percent"]) == pytest.approx((70.0, 50.0))
     assert told["pitch_sigma_deg"] == pytest.approx(np.rad2deg(0.1))
-
-
-def test_a_film_holds_its_pictures_and_says_so_where_it_cannot_be_written(tmp_path):
-    imageio = pytest.importorskip("imageio.v3")
-    pictures = [np.full((8, 12, 3), shade, np.uint8) for shade in (0, 90, 180, 250)]
-    film.write(tmp_path / "run.gif", pictures)
-    assert imageio.imread(tmp_path / "run.gif").shape == (4, 8, 12, 3)
-    with pytest.raises(PictureError, match="cannot be written"):
-        film.write(tmp_path / "run.nothing", pictures)
-
-
-def test_the_command_ends_with_one_sentence_where_the_gait_is_missing(capsys):
-    assert film.main(["run.gif", "--policy", "nobody"]) == 2
-    assert "error: nobody: no such policy" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["nothing", "truth"])
