@@ -48,9 +48,9 @@ class Command:
     intensity: bool = False  # the LiDAR gives intensities too
     texture: float = 0.0  # what they tell of the walls: from 0, all alike, to 1, an old, wet metro
     hidden_start: bool = False  # the true start is off the one that is reported
-    motion: Literal["wheels", "rover"] = (
-        "wheels"  # `rover` has mass: physics in MJX, best begun from a policy on wheels
-    )
+    # `rover` has mass: physics in MJX, best begun from a policy on wheels; `b2` is a planar robot that obeys as late as
+    # one on four legs, on which `benchmarks.b2_traverse` tries the policy
+    motion: Literal["wheels", "rover", "b2"] = "wheels"
     val: Path | None = None  # tunnels of the evaluation after training; those of the training if left out
     preset: str | None = None  # `cpu` or `gpu`; what jax runs on if left out
     seeds: tuple[int, ...] = ()  # train these seeds at once, each into `out/seed-<k>`

@@ -139,7 +139,7 @@ def open_world(
     task = require_task(task)
     if tunnel is None and st.TASKS[task].rule.goal_kind != "cover":
         tunnel = _TUNNELS[preset or "cpu"]
-    chosen = {"hidden_start": hidden_start, "intensity": intensity, "texture": texture}
+    chosen: dict[str, Any] = {"hidden_start": hidden_start, "intensity": intensity, "texture": texture}
     chosen |= {"motion": motion} if motion != MOTIONS[0] else {}
     world = _open(task, tunnel, lining, sensor, chosen)
     return world if val is None else dataclasses.replace(world, val=_open(task, val, lining, sensor, chosen))

@@ -162,8 +162,8 @@ def _pictures(drawn: Drawn, radius: float, title: str, count: int, view: View | 
     for row in np.unique(np.linspace(0, len(drawn) - 1, count).astype(int)):
         draw_plan(row)
         draw_strip(row)
-        for image in behind:
-            image.set_data(view(row))
+        if view is not None:
+            behind[0].set_data(view(row))
         figure.canvas.draw()
         yield np.asarray(figure.canvas.buffer_rgba())[..., :3].copy()  # type: ignore[attr-defined]
     plt.close(figure)

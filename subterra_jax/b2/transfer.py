@@ -174,7 +174,8 @@ class _Keep:
     env: TunnelEnv
 
     def __call__(self, now: Episode, taken: Taken, params: EnvParams) -> Row:
-        before, after, motion = taken.before, taken.after, self.env.motion
+        before, after = taken.before, taken.after
+        motion: Any = self.env.motion
         level = scan(params.tunnel, before.position, before.heading, before.station, params.lidar, True)
         lean = jnp.zeros(2)
         if not motion.on_the_plan:

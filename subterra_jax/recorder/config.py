@@ -140,7 +140,7 @@ def open_world(config: RecorderConfig) -> World:
     spatial = config.sensor != SENSORS[0]
     plan = st.load_tunnel(config.tunnel or first_tunnel(name, spatial), solid=spatial)
     try:
-        physics = {} if config.motion == MOTIONS[0] else {"engine": "mujoco"}
+        physics: dict[str, Any] = {} if config.motion == MOTIONS[0] else {"engine": "mujoco"}
         env, params = st.make(name, plan, config.lining, sensor=config.sensor, motion=config.motion, **physics)
     except ValueError as error:
         raise RecorderError(str(error)) from error
