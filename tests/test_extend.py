@@ -89,8 +89,8 @@ def test_its_params_are_randomised_like_those_of_the_package(desk):
     gyro = load_file(desk / "gyro.py")
     env, params = st.make("Subterra/Traverse-v1", parts=[gyro.Gyro()])
     mixed, axes = st.randomize(jax.random.key(0), params, {"gyro.sigma": (0.1, 0.2)}, 8)
-    obs, _ = st.AutoReset(env, params_axes=axes).reset(jax.random.key(1), mixed, 8)
-    assert obs.shape == (8, 19)
+    batch = st.AutoReset(env, params_axes=axes)
+    assert jax.eval_shape(lambda params: batch.reset(jax.random.key(1), params, 8), mixed)[0].shape == (8, 19)
     assert float(mixed.parts["gyro"].sigma.min()) >= 0.1
 
 

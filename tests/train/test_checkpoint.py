@@ -4,6 +4,7 @@ import dataclasses
 import shutil
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -115,7 +116,8 @@ def test_a_resumed_run_knows_its_best_score_and_for_how_long_the_goal_has_held(t
     learner = make_learner(world, TrainConfig(n_envs=4, unroll=8, minibatches=2, hidden=(8,)))
     run = folder.RunFolder(tmp_path / "run", world, learner)
     run.start()
-    first = snapshot.started(learner, jax.jit(learner.init)(jax.random.PRNGKey(0), world.params))
+    state = jax.eval_shape(learner.init, jax.random.PRNGKey(0), world.params)
+    first = snapshot.started(learner, jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), state))
     best = dataclasses.replace(first.best, score=(0.75, 12.5), iteration=4)
     run.save(dataclasses.replace(first, iteration=9, solved_for=3, best=best))
     again = run.resume()
