@@ -13,13 +13,12 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-from jaxtyping import Float
 from matplotlib.figure import Figure
 from PIL import Image
 
 from benchmarks.draw.scene import picture
 from benchmarks.results import png_bytes
-from benchmarks.truth import Truth, centreline, scene_points
+from benchmarks.truth import Truth, centreline
 from subterra_jax.pictures.renderer import PictureError
 
 _STYLE = """
@@ -80,9 +79,7 @@ def html_table(columns: tuple[str, ...], rows: Iterable[tuple[tuple[str, ...], b
     return f"<table><thead><tr>{line(columns, 'th')}</tr></thead><tbody>{''.join(body)}</tbody></table>"
 
 
-_INK, _TRUTH, _SECOND, _POINTS = "#1b4965", "#c1121f", "#e09f3e", "#8d99ae"
-_SLICE = 0.15  # m either side of a section
-_MOST_POINTS = 6_000
+_INK, _TRUTH = "#1b4965", "#c1121f"
 
 
 def plan_and_profile(truth: Truth, built: tuple[np.ndarray, np.ndarray]) -> Figure:
@@ -106,27 +103,6 @@ def plan_and_profile(truth: Truth, built: tuple[np.ndarray, np.ndarray]) -> Figu
     plan.legend(fontsize=8)
     for axes in (plan, profile):
         axes.grid(alpha=0.3)
-    return figure
-
-
-def section_overlays(bore_path: Path, points: Float[np.ndarray, "p 3"], count: int = 4) -> Figure:
-    """Draws sections of the bore, evenly spread, over the registered points within 15 cm (tunnel frame, m)."""
-    with np.load(bore_path) as data:
-        bore = {name: data[name] for name in data.files}
-    rows = np.linspace(0, len(bore["station"]) - 1, count + 2).astype(int)[1:-1]
-    figure, axes = plt.subplots(1, count, figsize=(3 * count, 4.4), sharey=True, layout="constrained")
-    for panel, row in zip(axes, rows, strict=True):
-        offset = points - bore["position"][row]
-        near = offset[np.abs(offset @ bore["tangent"][row]) < _SLICE]
-        near = near[np.linalg.norm(near, axis=1) < 2 * bore["radius"][row].max()]
-        near = near[:: max(1, len(near) // _MOST_POINTS)]
-        panel.plot(near @ bore["lateral"][row], near @ bore["up"][row], ".", ms=0.8, color=_POINTS, rasterized=True)
-        angle, radius = (np.append(values, values[0]) for values in (bore["angle"], bore["radius"][row]))
-        panel.plot(radius * np.cos(angle), radius * np.sin(angle), color=_INK, lw=1.2)
-        panel.set(title=f"station {bore['station'][row]:.1f} m", xlabel="lateral, m", aspect="equal")
-        panel.invert_xaxis()  # looking towards growing station, left is left
-        panel.grid(alpha=0.3)
-    axes[0].set_ylabel("above the axis, m")
     return figure
 
 
@@ -201,12 +177,10 @@ def _bore_parts(out: Path, truth: Truth) -> list[str]:
         view = html_figure(picture(scene, "scout"), "The scene in MuJoCo, from the camera of its scout robot.")
     except PictureError as error:
         view = html_text(f"No picture of the scene: {error}")
-    line = "Plan and profile of the centreline; nothing is aligned."
-    sections = "Sections over the registered points within 15 cm, looking along the tunnel."
+    line = "Plan and profile of the centreline; nothing is aligned. Sections stand in scene/build.html."
     return [
         view,
         html_figure(plan_and_profile(truth, centreline(scene)), line),
-        html_figure(section_overlays(scene / "bore.npz", scene_points(scene)), sections),
     ]
 
 

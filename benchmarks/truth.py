@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import trimesh
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
@@ -60,13 +59,6 @@ def centreline(scene: Path) -> tuple[np.ndarray, np.ndarray]:
     with np.load(scene / "bore.npz") as bore:
         origin = np.asarray(json.loads((scene / "manifest.json").read_text())["frame"]["origin"])
         return bore["station"], bore["position"] + origin
-
-
-def scene_points(scene: Path) -> Float[np.ndarray, "p 3"]:
-    """Returns the registered cloud of a scene, thinned, in the tunnel frame, m."""
-    cloud = trimesh.load(scene / "cloud.ply")
-    assert isinstance(cloud, trimesh.PointCloud)  # for the type checker; the builder writes no faces
-    return np.asarray(cloud.vertices)
 
 
 def compare(scene: Path, truth: Truth) -> Comparison:

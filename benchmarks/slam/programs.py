@@ -74,8 +74,7 @@ def _run_rko(recording: Path) -> Poses:
             program.add_imu_measurement(*content, stamp, extrinsic_imu2base=mount)
         else:
             seen = content[(content["x"] != 0.0) | (content["y"] != 0.0)]
-            xyz = np.column_stack([seen["x"], seen["y"], seen["z"]]).astype(np.float64)
-            program.register_scan(xyz, stamp + seen["t"].astype(np.int64), np.eye(4), stamp, stamp + 100_000_000)
+            program.register_scan(_xyz(seen), stamp + seen["t"].astype(np.int64), np.eye(4), stamp, stamp + 100_000_000)
             rows.append((1e-9 * stamp + 0.1, np.array(program.pose())))
         seconds += time.perf_counter() - started
     return np.array([t for t, _ in rows]), np.array([pose for _, pose in rows]), seconds
