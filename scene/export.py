@@ -71,14 +71,14 @@ def read_parts(path: Path) -> list[Part]:
     by_material: dict[int, list[trimesh.Trimesh]] = {}
     for geom in np.flatnonzero(np.isin(model.geom_group, _DRAWN)):
         turn, place = data.geom_xmat[geom].reshape(3, 3), data.geom_xpos[geom]
-        vertices, faces = _triangles(model, int(geom))
+        vertices, faces = geom_triangles(model, int(geom))
         mesh = trimesh.Trimesh(vertices @ turn.T + place, faces, process=False)
         by_material.setdefault(int(model.geom_matid[geom]), []).append(mesh)
     parts = [_join(model, material, meshes) for material, meshes in by_material.items()]
     return sorted(parts, key=lambda part: part.name)
 
 
-def _triangles(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
+def geom_triangles(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
     """Return a geom's corners in its own frame and its triangles."""
     kind, size = model.geom_type[geom], model.geom_size[geom]
     if kind == mujoco.mjtGeom.mjGEOM_MESH:

@@ -14,7 +14,7 @@ import tyro
 
 from benchmarks.fidelity import judge, outside
 from benchmarks.fidelity.case import Case, case_hash
-from benchmarks.fidelity.faults import ladder
+from benchmarks.fidelity.faults import runner
 from benchmarks.fidelity.faults.runner import Bench, is_bold, judge_outcomes, list_jobs, run_jobs
 from benchmarks.fidelity.files import FidelityError, read_kept, write_json
 from benchmarks.fidelity.inputs import (
@@ -159,15 +159,15 @@ def run_faults(config: FaultsConfig) -> None:
     Example: python -m benchmarks.fidelity faults --places 6 --scene build/tunnel --truth build/survey
     """
     require_folder(config.out)
-    ladder.check_ladder(config.kinds, config.places, config.draw)
+    runner.check_ladder(config.kinds, config.places, config.draw)
     case = read_case(complete_inputs(config))
     if not case.has("reference"):
         raise FidelityError("faults need a reference: give --recording with --trajectory, or --truth")
-    rows = ladder.climb_ladders(case, config.kinds, config.places, config.draw, config.out)
+    rows = runner.climb_ladders(case, config.kinds, config.places, config.draw, config.out)
     print(
         f"{case.candidate.name}: smallest sizes noticed at 95 % of {config.places} places; {config.out / 'ladder.csv'}"
     )
-    for one in ladder.write_ladder(config.out, rows):
+    for one in runner.write_ladder(config.out, rows):
         factor, unit = (1000.0, "mm") if one["kind"] == "gauge" else (100.0, "cm")
         print(f"  {one['kind']} over {one['length']:g} m: {factor * one['size_95']:.2g} {unit}; "
               f"{factor * one['asked']:g} {unit} noticed at {one['noticed_at_asked']} of {one['places']}")  # fmt: skip

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.fidelity.files import FidelityError, file_hash
 from benchmarks.fidelity.meshes import concatenate_meshes
+from scene.export import geom_triangles
 
 
 def load_model(scene: Path) -> mujoco.MjModel:
@@ -53,21 +54,8 @@ class Geoms:
         return concatenate_meshes(meshes)
 
     def mesh(self, geom: int) -> trimesh.Trimesh:
-        """Return a box or mesh geom as triangles in the world frame, m.
-
-        Raises:
-            ValueError: Another kind of geom.
-        """
-        model, kind = self.model, self.model.geom_type[geom]
-        if kind == mujoco.mjtGeom.mjGEOM_BOX:
-            mesh = trimesh.creation.box(2.0 * model.geom_size[geom])
-        elif kind == mujoco.mjtGeom.mjGEOM_MESH:
-            k = model.geom_dataid[geom]
-            vertices = model.mesh_vert[model.mesh_vertadr[k] : model.mesh_vertadr[k] + model.mesh_vertnum[k]]
-            faces = model.mesh_face[model.mesh_faceadr[k] : model.mesh_faceadr[k] + model.mesh_facenum[k]]
-            mesh = trimesh.Trimesh(vertices.astype(float), faces, process=False)
-        else:
-            raise ValueError(f"geom {self.names[geom]} is neither a box nor a mesh")
+        """Return a geom as triangles in the world frame, m; raises `RecordingError` for a kind that has none."""
+        mesh = trimesh.Trimesh(*geom_triangles(self.model, geom), process=False)
         placement = np.eye(4)
         placement[:3, :3] = Rotation.from_matrix(self.data.geom_xmat[geom].reshape(3, 3)).as_matrix()
         placement[:3, 3] = self.data.geom_xpos[geom]

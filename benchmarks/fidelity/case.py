@@ -87,30 +87,30 @@ def kept_until(category: str, keep: Callable[[Function], Function]) -> Callable[
 
 def per_case(function: Function) -> Function:
     """Keeps the result of a function, for each of its arguments after the case, once per case."""
-    return kept_in(function, lambda case, *_: (case.cache, ()))
+    return _kept_in(function, lambda case, *_: (case.cache, ()))
 
 
 def per_hold(function: Function) -> Function:
     """Keeps the result of a function of recording and seed once for all candidates."""
-    return kept_in(function, lambda case, *_: _reference_cache(case, case.hold))
+    return _kept_in(function, lambda case, *_: _reference_cache(case, case.hold))
 
 
 def per_truth(function: Function) -> Function:
     """Keeps the result of a function of truth and seed once for all candidates."""
-    return kept_in(function, lambda case, *_: _reference_cache(case, case.truth))
+    return _kept_in(function, lambda case, *_: _reference_cache(case, case.truth))
 
 
 def per_reference(function: Function) -> Function:
     """Keeps the result of a function of the truth, or of the recording where there is none, for all candidates."""
-    return kept_in(function, lambda case, *_: _reference_cache(case, case.truth or case.hold))
+    return _kept_in(function, lambda case, *_: _reference_cache(case, case.truth or case.hold))
 
 
 def per_side(function: Function) -> Function:
     """Keeps the result of a function of a case and `real`: for all candidates where `real`, else once per case."""
-    return kept_in(function, lambda case, real: _reference_cache(case, case.hold) if real else (case.cache, ()))
+    return _kept_in(function, lambda case, real: _reference_cache(case, case.hold) if real else (case.cache, ()))
 
 
-def kept_in(function: Function, place: Callable[..., tuple[dict[Any, Any], tuple[Any, ...]]]) -> Function:
+def _kept_in(function: Function, place: Callable[..., tuple[dict[Any, Any], tuple[Any, ...]]]) -> Function:
     """Keeps the results of a function in the dictionary that `place` gives, by its arguments and the given settings."""
 
     @wraps(function)

@@ -23,7 +23,7 @@ from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.derive.curve import Curve
 from benchmarks.fidelity.files import FidelityError, file_hash, write_json
 from benchmarks.fidelity.references import Hold, HoldConfig, load_hold, load_truth
-from benchmarks.fidelity.windows.measures import LONG
+from benchmarks.fidelity.windows.judge import LONG
 from scene.errors import require_input
 from scene.progress import Stages
 from subterra_jax.host.errors import SubterraError

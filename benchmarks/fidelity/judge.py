@@ -23,7 +23,7 @@ from benchmarks.fidelity.leaks import MEDIAN_FLOOR, NOISE_BAND, find_leaks
 from benchmarks.fidelity.registry import Value, dump_values, evaluate, load_values, missing
 from benchmarks.fidelity.scoring import Scored
 from benchmarks.fidelity.table import Metric
-from benchmarks.fidelity.windows import measures
+from benchmarks.fidelity.windows import judge as windows_of
 from benchmarks.fidelity.windows.judge import Windows, dump_windows, judge_windows, load_windows
 from scene.progress import Stages
 
@@ -252,7 +252,7 @@ def constants() -> dict[str, Any]:
         "controls": [asdict(control) for control in faults.suite_controls().values()],
         "quiet": [faults.GLOBAL_LIMIT, faults.THINNED_LIMIT, faults.QUIET_LIMIT, faults.MONOTONE, faults.UNORDERED],
         "leaks": [list(NOISE_BAND), MEDIAN_FLOOR],
-        "windows": {sensor: measures.limits(sensor) for sensor in measures.SENSORS},
+        "windows": {sensor: windows_of.limits(sensor) for sensor in windows_of.SENSORS},
         "faults": {name: asdict(one) for name, one in faults.stated_faults(100.0).items()},
     }  # fmt: skip
 

@@ -13,7 +13,6 @@ from benchmarks.fidelity.table import Metric
 
 BLOCK = 10.0  # m along the tunnel; points nearer than this are not independent
 RESAMPLES = 200
-FEWEST_IN_BLOCK = 5  # samples of a stretch that has a value of its own
 
 Statistic = Callable[[Float[np.ndarray, " k"]], float]
 _ABSENT = {
@@ -32,9 +31,6 @@ class Value:
     n: int = 0  # Number of samples
     reason: str = ""  # Cause of a missing value, or remark on the value
     failed: bool = False  # The computation broke on this candidate; it scores 0 instead of being left out
-    # Start, m, and value of the stretches of `BLOCK` with the lowest and with the highest value; `None` where the
-    # metric has no values along the tunnel
-    extremes: tuple[tuple[float, float], tuple[float, float]] | None = None
 
 
 class Samples(NamedTuple):
@@ -77,10 +73,6 @@ def rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def root_of_mean(squares: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(squares)))
-
-
 def percentile(percent: float) -> Statistic:
     return lambda values: float(np.percentile(values, percent))
 
@@ -106,27 +98,13 @@ def estimate(
     stride = max(1, len(samples) // most)
     order = np.argsort(station[::stride] // BLOCK, kind="stable")
     thin, block = samples[::stride][order], (station[::stride] // BLOCK)[order]
-    cuts = np.flatnonzero(np.diff(block)) + 1
-    groups = np.split(thin, cuts)
-    extremes = _extremes(statistic, groups, BLOCK * block[np.concatenate([[0], cuts])])
+    groups = np.split(thin, np.flatnonzero(np.diff(block)) + 1)
     if len(groups) < 3:
-        return Value(value, None, len(samples), "too short for an interval", extremes=extremes)
+        return Value(value, None, len(samples), "too short for an interval")
     draws = rng.integers(0, len(groups), (RESAMPLES, len(groups)))
     spread = [statistic(np.concatenate([groups[i] for i in draw])) for draw in draws]
     low, high = np.nanpercentile(spread, [2.5, 97.5])
-    return Value(value, (float(low), float(high)), len(samples), extremes=extremes)
-
-
-def _extremes(
-    statistic: Statistic, groups: list[np.ndarray], start: Float[np.ndarray, " b"]
-) -> tuple[tuple[float, float], tuple[float, float]] | None:
-    """Return start and value of the lowest and the highest stretch; those with few samples do not count."""
-    found = [
-        (float(value), float(at))
-        for group, at in zip(groups, start, strict=True)
-        if len(group) >= FEWEST_IN_BLOCK and np.isfinite(value := statistic(group))
-    ]
-    return None if not found else (min(found)[::-1], max(found)[::-1])
+    return Value(value, (float(low), float(high)), len(samples))
 
 
 def compute_metric(case: Case, row: Metric) -> Value:
@@ -174,11 +152,5 @@ def dump_values(values: dict[str, Value]) -> dict[str, Any]:
 
 
 def load_values(content: dict[str, Any]) -> dict[str, Value]:
-    return {
-        id: Value(**{
-            **entry,
-            "interval": tuple(entry["interval"]) if entry["interval"] else None,
-            "extremes": tuple(tuple(one) for one in entry["extremes"]) if entry.get("extremes") else None,
-        })
-        for id, entry in content.items()
-    }  # fmt: skip
+    pairs = {id: tuple(entry["interval"]) if entry["interval"] else None for id, entry in content.items()}
+    return {id: Value(**{**entry, "interval": pairs[id]}) for id, entry in content.items()}

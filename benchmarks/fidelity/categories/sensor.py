@@ -59,9 +59,8 @@ def beam_range_bias(case: Case) -> Samples:
 @metric("beam_rel_medae", "BEA", D(0.298, 1.3), "%", needs="hold", of=np.median)
 def beam_rel_medae(case: Case) -> Samples:
     """Median absolute range difference as a share of the range, %."""
-    hit, (error, station) = cast_beams(case).hit, _range_error(case)
-    relative = 100.0 * np.abs(error) / returns(case).range[hit]
-    return Samples(relative, station, BOOTSTRAP_SAMPLES)
+    error, station = _range_error(case)
+    return Samples(100.0 * np.abs(error) / returns(case).range[cast_beams(case).hit], station, BOOTSTRAP_SAMPLES)
 
 
 @metric("beam_within_10cm", "BEA", U(0.85, 0.999754), needs="hold", of=np.mean)
@@ -92,31 +91,30 @@ def beam_return_bacc(case: Case) -> Value:
     assert case.hold is not None
     if not case.hold.knows_missing:
         return missing(_NO_SILENCE)
-    beams = silence(case)
-    if not beams.silent.any() or beams.silent.all():
+    silent, expected = silence(case)
+    if not silent.any() or silent.all():
         return missing("all beams of the recording came back, or none")
-    right = [np.mean(beams.expected_silent[beams.silent]), np.mean(~beams.expected_silent[~beams.silent])]
-    return number(float(np.mean(right)), len(beams.silent))
+    return number(float(np.mean([np.mean(expected[silent]), np.mean(~expected[~silent])])), len(silent))
 
 
 @metric("selfcast_p2s_mean", "BEA", unit="m", needs="hold", evidence="C")
 def selfcast_p2s_mean(case: Case) -> Value:
     """The paper's headline: mean distance of a cloud cast in the mesh to that mesh, m."""
-    return number(float(np.mean(self_cast(case).distance)), len(self_cast(case).distance), _CIRCULAR)
+    return number(float(np.mean(self_cast(case)[0])), len(self_cast(case)[0]), _CIRCULAR)
 
 
 @metric("selfcast_within_10cm", "BEA", LOGGED_UP, needs="hold", evidence="C")
 def selfcast_within_10cm(case: Case) -> Value:
     """The paper's headline: share of that cloud within 10 cm."""
-    near = self_cast(case).distance <= 0.10
+    near = self_cast(case)[0] <= 0.10
     return number(float(np.mean(near)), len(near), _CIRCULAR)
 
 
 @metric("selfcast_noise_ratio", "BEA", needs="hold", evidence="C")
 def selfcast_noise_ratio(case: Case) -> Value:
     """That mean over the mean that noise alone gives on a plane; 1: only noise was measured."""
-    cloud = self_cast(case)
-    return number(float(np.mean(cloud.distance) / cloud.noise_alone), len(cloud.distance), _CIRCULAR)
+    distance, noise_alone = self_cast(case)
+    return number(float(np.mean(distance) / noise_alone), len(distance), _CIRCULAR)
 
 
 # DIS: the distributions that a sensor measures in the candidate against those of the recording.
@@ -145,7 +143,7 @@ def range_w1(case: Case) -> Value:
 @metric("elevation_w1", "DIS", D(0.00534, 1), "m", needs="hold")
 def elevation_w1(case: Case) -> Value:
     """Mean over bins of 5° of elevation of the ranges' Wasserstein-1 distance, m."""
-    elevation = np.round(beam_directions(case).elevation / _DIRECTION_BIN).astype(int)
+    elevation = np.round(beam_directions(case)[1] / _DIRECTION_BIN).astype(int)
     distances = [wasserstein_distance(real, synthetic) for real, synthetic in _ranges_by_bin(case, elevation)]
     return number(float(np.mean(distances)), len(elevation))
 
@@ -153,7 +151,7 @@ def elevation_w1(case: Case) -> Value:
 @metric("azimuth_profile_rmse", "DIS", D(0.00191, 0.039), "m", needs="hold")
 def azimuth_profile_rmse(case: Case) -> Value:
     """Root mean square over bins of 5° of azimuth of the difference of middle ranges, m."""
-    azimuth = np.round(beam_directions(case).azimuth / _DIRECTION_BIN).astype(int)
+    azimuth = np.round(beam_directions(case)[0] / _DIRECTION_BIN).astype(int)
     gaps = [middle_range(real) - middle_range(synthetic) for real, synthetic in _ranges_by_bin(case, azimuth)]
     return number(float(np.sqrt(np.mean(np.square(gaps)))), len(azimuth))
 
@@ -185,15 +183,11 @@ def _ranges_by_bin(case: Case, group: np.ndarray) -> list[tuple[np.ndarray, np.n
 @metric("incidence_w1", "DIS", D(0.341, 12), "deg", needs="hold")
 def incidence_w1(case: Case) -> Value:
     """Wasserstein-1 distance of the incidence angles, normals of both clouds by local planes, degrees."""
-    real, synthetic = (
-        _incidence_angles(case, planes) for planes in (clouds.real_planes(case), clouds.synthetic_planes(case))
-    )
-    return number(float(wasserstein_distance(real, synthetic)), len(real))
-
-
-def _incidence_angles(case: Case, planes: clouds.Planes) -> np.ndarray:
-    cosine = np.abs(np.einsum("ij,ij->i", planes.normal, returns(case).direction[clouds.plane_rows(case)]))
-    return np.rad2deg(np.arccos(np.minimum(cosine[np.isfinite(cosine)], 1.0)))
+    angles, direction = [], returns(case).direction[clouds.plane_rows(case)]
+    for planes in (clouds.real_planes(case), clouds.synthetic_planes(case)):
+        cosine = np.abs(np.einsum("ij,ij->i", planes.normal, direction))
+        angles.append(np.rad2deg(np.arccos(np.minimum(cosine[np.isfinite(cosine)], 1.0))))
+    return number(float(wasserstein_distance(*angles)), len(angles[0]))
 
 
 @metric("dropout_diff", "DIS", D(0.00356, 0.1), needs="hold")
@@ -202,8 +196,8 @@ def dropout_diff(case: Case) -> Value:
     assert case.hold is not None
     if not case.hold.knows_missing:
         return missing(_NO_SILENCE)
-    beams = silence(case)
-    return number(abs(float(np.mean(beams.silent)) - float(np.mean(beams.expected_silent))), len(beams.silent))
+    silent, expected = silence(case)
+    return number(abs(float(np.mean(silent)) - float(np.mean(expected))), len(silent))
 
 
 @metric("noise_sigma_diff", "DIS", D(0.0068, 0.03), "m", needs="hold")
@@ -250,10 +244,9 @@ def c2st_auc(case: Case) -> Value:
     label = np.repeat([0, 1], len(real))
     block = np.tile(scan * _FOLDS // len(scan), 2)
     forest = RandomForestClassifier(100, min_samples_leaf=3, random_state=case.seed)
-    guess = cross_val_predict(
-        forest, descriptors, label, groups=block, cv=GroupKFold(_FOLDS), method="predict_proba"
-    )[:, 1]  # fmt: skip
-    return number(float(roc_auc_score(label, guess)), len(label))
+    folds = GroupKFold(_FOLDS)
+    guess = cross_val_predict(forest, descriptors, label, groups=block, cv=folds, method="predict_proba")
+    return number(float(roc_auc_score(label, guess[:, 1])), len(label))
 
 
 # DEG: whether a scan in the candidate fixes its own pose as well, and as badly, as the recorded one.
@@ -292,7 +285,7 @@ def deg_weak_angle_diff(case: Case) -> Samples:
 @metric("deg_eig_w1", "DEG", D(0.0783, 0.8), needs="hold")
 def deg_eig_w1(case: Case) -> Value:
     """Wasserstein-1 distance of the distributions of log10 of the smallest eigenvalue."""
-    smallest = [np.log10(scans.translation[:, 0]) for scans in _both_information(case)]
+    smallest = (np.log10(scans.translation[:, 0]) for scans in _both_information(case))
     real, synthetic = (values[np.isfinite(values)] for values in smallest)
     return number(float(wasserstein_distance(real, synthetic)), len(real))
 

@@ -18,7 +18,7 @@ from benchmarks.fidelity.derive.ground import (
 )
 from benchmarks.fidelity.derive.sections import lining_radii, sections
 from benchmarks.fidelity.derive.surface import surface_nearest
-from benchmarks.fidelity.registry import Samples, Value, mean, missing, number, pass_or_fail, percentile, root_of_mean
+from benchmarks.fidelity.registry import Samples, Value, mean, missing, number, pass_or_fail, percentile, rms
 from benchmarks.fidelity.table import B, D, P, U, metric
 
 _EDGE_NEAR = 0.10  # m between two edges that agree
@@ -80,8 +80,7 @@ def free2d_area_rel_err(case: Case) -> Value:
 def free2d_width_mae(case: Case) -> Samples:
     """Mean absolute error of the free width, m; an open side counts as 20 m."""
     station, judged, reference = plane.free_widths(case)
-    error = np.abs(np.minimum(judged, _WIDEST) - np.minimum(reference, _WIDEST))
-    return Samples(error, station)
+    return Samples(np.abs(np.minimum(judged, _WIDEST) - np.minimum(reference, _WIDEST)), station)
 
 
 @metric("free2d_width_min_err", "F2D", D(1e-06, 0.12), "m", needs="reference")
@@ -91,14 +90,13 @@ def free2d_width_min_err(case: Case) -> Value:
     return number(abs(float(np.min(judged)) - float(np.min(reference))), len(judged))
 
 
-@metric("free2d_edt_rmse", "F2D", D(0.0302, 0.14), "m", needs="reference", of=root_of_mean)
+@metric("free2d_edt_rmse", "F2D", D(0.0302, 0.14), "m", needs="reference", of=rms)
 def free2d_edt_rmse(case: Case) -> Samples:
     """Root mean square error of the distance to the edge of free space, where either is free, m."""
     judged, reference, rows = plane.gapless_maps(case)
     picked = judged | reference
     clear = [_edge_distance(free, plane.free_plane(case).lattice.edge) for free in (judged, reference)]
-    station = np.broadcast_to(rows[:, None], picked.shape)[picked]
-    return Samples(((clear[0] - clear[1]) ** 2)[picked], station)
+    return Samples((clear[0] - clear[1])[picked], np.broadcast_to(rows[:, None], picked.shape)[picked])
 
 
 def _edge_distance(free: np.ndarray, edge: float) -> np.ndarray:
@@ -170,38 +168,32 @@ def free3d_false_occupied(case: Case) -> Samples:
     return Samples(outside[among].astype(float), local[among, 0])
 
 
-@metric("free3d_esdf_rmse", "F3D", D(1e-06, 0.3), "m", needs="reference", of=root_of_mean)
+@metric("free3d_esdf_rmse", "F3D", D(1e-06, 0.3), "m", needs="reference", of=rms)
 def free3d_esdf_rmse(case: Case) -> Samples:
     """Root mean square error of the distance to the nearest surface within 1 m of the axis, m."""
-    both = freespace.axis_clearances(case)
-    error = both.judged - both.reference
-    station = np.repeat(both.station, error.shape[1])
-    return Samples((error**2).ravel(), station)
+    station, judged, reference = freespace.axis_clearances(case)
+    return Samples((judged - reference).ravel(), np.repeat(station, judged.shape[1]))
 
 
 @metric("free3d_inscribed_err", "F3D", D(1e-06, 0.3), "m", needs="reference", of=mean)
 def free3d_inscribed_err(case: Case) -> Samples:
     """Mean absolute error of the radius of the largest sphere near the axis, m."""
-    both = freespace.axis_clearances(case)
-    error = np.abs(both.judged.max(axis=1) - both.reference.max(axis=1))
-    return Samples(error, both.station)
+    station, judged, reference = freespace.axis_clearances(case)
+    return Samples(np.abs(judged.max(axis=1) - reference.max(axis=1)), station)
 
 
-@metric("free3d_headroom_rmse", "F3D", D(1e-06, 0.06), "m", needs="reference", of=root_of_mean)
+@metric("free3d_headroom_rmse", "F3D", D(1e-06, 0.06), "m", needs="reference", of=rms)
 def free3d_headroom_rmse(case: Case) -> Samples:
     """Root mean square error of floor to crown in three lanes, m."""
     station, judged, reference = freespace.headrooms(case)
-    squares = (judged - reference) ** 2
-    lanes = np.repeat(station, squares.shape[1])
-    return Samples(squares.ravel(), lanes)
+    return Samples((judged - reference).ravel(), np.repeat(station, judged.shape[1]))
 
 
 @metric("free3d_envelope_agree", "F3D", U(0.9, 0.999999), needs="reference", of=mean)
 def free3d_envelope_agree(case: Case) -> Samples:
     """Share of sections and envelopes in which lining and reference agree whether the envelope is cut into."""
     judged, reference = freespace.infringements(case)
-    agree = (judged == reference).mean(axis=1)
-    return Samples(agree, sections(case).station)
+    return Samples((judged == reference).mean(axis=1), sections(case).station)
 
 
 @metric("free3d_hold_poses_free", "F3D", U(0.95, 0.999999), gate=True, needs="hold", of=mean)
@@ -279,8 +271,7 @@ def way_clearance_error(case: Case, statistic) -> Value:
 def nav_drivable_width_mae(case: Case) -> Samples:
     """Mean absolute error of the drivable width, m."""
     judged, reference = both_grounds(case)
-    error = np.abs(judged.width - reference.width)
-    return Samples(error, judged.station)
+    return Samples(np.abs(judged.width - reference.width), judged.station)
 
 
 @metric("nav_feasible_agree", "NAV", U(0.9, 0.999999), needs="reference")

@@ -48,9 +48,8 @@ def mesh_distance(case: Case) -> Samples:
 @metric("c2m_within_10cm", "C2M", U(0.949, 0.999999), needs="hold", of=np.mean, args=(0.10,))
 def mesh_precision(case: Case, within: float) -> Samples:
     """Share of held-out points within a distance of the surface; at 10 cm the paper's figure on unseen points."""
-    distances = mesh_distances(case)
-    near = (distances.distance <= within).astype(float)
-    return Samples(near, distances.station, BOOTSTRAP_SAMPLES)
+    near = mesh_distances(case).distance <= within
+    return Samples(near.astype(float), mesh_distances(case).station, BOOTSTRAP_SAMPLES)
 
 
 @metric("c2m_signed_bias", "C2M", D(0.000154, 0.08), "m", needs="hold", of=mean_magnitude)
@@ -105,15 +104,14 @@ def m3c2_signif_frac(case: Case) -> Samples:
 
 
 def _completeness(case: Case, within: float) -> np.ndarray:
-    return (cloud_distances(case).distance <= within).astype(float)
+    return (cloud_distances(case)[0] <= within).astype(float)
 
 
 @metric("comp_10cm", "CMP", U(0.86, 0.999836), needs="hold", of=np.mean, args=(0.10,))
 @metric("comp_20cm", "CMP", LOGGED_UP, needs="hold", of=np.mean, args=(0.20,))
 def completeness(case: Case, within: float) -> Samples:
     """Share of the observed surface with a held-out point within a distance."""
-    station = cloud_distances(case).station
-    return Samples(_completeness(case, within), station, BOOTSTRAP_SAMPLES)
+    return Samples(_completeness(case, within), cloud_distances(case)[1], BOOTSTRAP_SAMPLES)
 
 
 @metric("fscore_5cm", "CMP", LOGGED_UP, needs="hold", args=(0.05,))
@@ -123,13 +121,13 @@ def fscore(case: Case, within: float) -> Value:
     """Harmonic mean of precision and completeness at a distance."""
     precision = float(np.mean(mesh_distances(case).distance <= within))
     recall = float(np.mean(_completeness(case, within)))
-    return number(2.0 * precision * recall / max(precision + recall, 1e-12), len(cloud_distances(case).distance))
+    return number(2.0 * precision * recall / max(precision + recall, 1e-12), len(cloud_distances(case)[0]))
 
 
 @metric("chamfer_l1", "CMP", D(0.0211, 0.25), "m", needs="hold")
 def chamfer_l1(case: Case) -> Value:
     """Mean of the two directed mean distances, m."""
-    return number(float(np.mean(mesh_distances(case).distance) + np.mean(cloud_distances(case).distance)) / 2.0)
+    return number(float(np.mean(mesh_distances(case).distance) + np.mean(cloud_distances(case)[0])) / 2.0)
 
 
 @metric("dcd", "CMP", needs="hold")
@@ -141,14 +139,14 @@ def dcd(case: Case) -> Value:
 @metric("hausdorff_p99", "CMP", D(0.07, 1.5), "m", needs="hold")
 def hausdorff_p99(case: Case) -> Value:
     """Larger of the two directed 99th percentiles, m."""
-    both = mesh_distances(case).distance, cloud_distances(case).distance
+    both = mesh_distances(case).distance, cloud_distances(case)[0]
     return number(max(float(np.percentile(d, 99)) for d in both))
 
 
 @metric("comp_chainage_min", "CMP", U(0.86, 0.999536), needs="hold")
 def comp_chainage_min(case: Case) -> Value:
     """Smallest `comp_10cm` of a bin of about 10 m; 0 where there are held-out returns but no candidate."""
-    group = station_bins(case, cloud_distances(case).station)
+    group = station_bins(case, cloud_distances(case)[1])
     total = station_bins(case, returns(case).local[:, 0])
     bin_count = int(total.max()) + 1
     count = np.bincount(group, minlength=bin_count)
@@ -166,9 +164,8 @@ def extra_surface_frac(case: Case) -> Value:
 @metric("missing_surface_frac", "CMP", D(1e-06, 0.1), needs="hold", of=np.mean)
 def missing_surface_frac(case: Case) -> Samples:
     """Share of held-out points with no surface within 20 cm."""
-    distances = mesh_distances(case)
-    far = (distances.distance > _FAR).astype(float)
-    return Samples(far, distances.station, BOOTSTRAP_SAMPLES)
+    far = mesh_distances(case).distance > _FAR
+    return Samples(far.astype(float), mesh_distances(case).station, BOOTSTRAP_SAMPLES)
 
 
 # OCC: voxels of held-out points against the candidate seen by the same beams (the paper's Fig. 3).

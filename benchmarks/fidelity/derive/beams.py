@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from benchmarks.fidelity.case import Case, kept_until, per_case, per_hold
 from benchmarks.fidelity.derive.curve import Curve
-from benchmarks.fidelity.derive.surface import face_normals, surface_caster
+from benchmarks.fidelity.derive.surface import Caster, face_normals, surface_caster
 
 NODE_STEP = 1.0  # m between nodes
 _SWAY_WINDOW = 11  # nodes over which the sway of the carrier is smoothed away
@@ -109,12 +109,16 @@ def cast_beams(case: Case) -> CastBeams:
     """Casts every held-out beam with a return in everything visible of the candidate."""
     real, rays = returns(case), surface_caster(case)
     reach, face = rays.first(real.origin, real.direction)
-    cosine = np.zeros(len(face))
-    hit = face >= 0
-    normal = face_normals(rays.mesh, face[hit])
-    length = np.maximum(np.linalg.norm(normal, axis=1), 1e-300)
-    cosine[hit] = np.abs(np.einsum("ij,ij->i", normal, real.direction[hit])) / length
+    cosine, hit = np.zeros(len(face)), face >= 0
+    cosine[hit] = _incidence_cosines(rays, face[hit], real.direction[hit])
     return CastBeams(reach, face, np.minimum(cosine, 1.0), reach - real.range)
+
+
+def _incidence_cosines(
+    rays: Caster, face: Int[np.ndarray, " n"], direction: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, " n"]:
+    normal = face_normals(rays.mesh, face)
+    return np.abs(np.einsum("ij,ij->i", normal, direction)) / np.maximum(np.linalg.norm(normal, axis=1), 1e-300)
 
 
 def points_at(case: Case, reach: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
@@ -173,20 +177,9 @@ def station_bins(case: Case, station: Float[np.ndarray, " n"]) -> Int[np.ndarray
     return np.clip(((station - low) / (high - low) * count).astype(int), 0, count - 1)
 
 
-# Beams without a return.
-
-
-@dataclass(frozen=True)
-class Silence:
-    """Beams without a return, measured and expected."""
-
-    silent: Bool[np.ndarray, " n"]  # True where nothing came back
-    expected_silent: Bool[np.ndarray, " n"]  # True where the candidate gives no return within reach
-
-
 @per_case
-def silence(case: Case) -> Silence:
-    """Return the beams without a return, measured and expected in the candidate.
+def silence(case: Case) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+    """Return True for each beam without a return, as measured and as expected in the candidate.
 
     A beam is expected back if it meets the candidate within the sensor's reach and its echo, cos(incidence) over the
     squared distance, is not too weak. No data sheet says how weak: the cut is the one number that the recording sets,
@@ -197,14 +190,12 @@ def silence(case: Case) -> Silence:
     rays = surface_caster(case)
     reach, face = rays.first(hold.origin, hold.direction)
     met = np.flatnonzero((face >= 0) & (reach <= hold.range_max))
-    normal = face_normals(rays.mesh, face[met])
-    cosine = np.abs(np.einsum("ij,ij->i", normal, hold.direction[met]))
-    cosine /= np.maximum(np.linalg.norm(normal, axis=1), 1e-300)
+    cosine = _incidence_cosines(rays, face[met], hold.direction[met])
     order = np.argsort(cosine / np.maximum(reach[met], 0.1) ** 2, kind="stable")
     balance = np.concatenate([[0], np.cumsum(np.where(hold.returned[met[order]], -1, 1))])
     expected_silent = np.ones(len(reach), bool)
     expected_silent[met[order[int(np.argmax(balance)) :]]] = False
-    return Silence(~hold.returned, expected_silent)
+    return ~hold.returned, expected_silent
 
 
 # Directions of the beams, and descriptors of whole scans.
@@ -213,22 +204,15 @@ _DIRECTION_SECTORS = (12, 4)  # of azimuth and elevation
 _QUANTILES = (5, 25, 50, 75, 95)
 
 
-@dataclass(frozen=True)
-class BeamDirections:
-    """Direction of every returned beam, relative to the tunnel at the sensor."""
-
-    azimuth: Float[np.ndarray, " n"]  # Angle from the tunnel's axis ahead, to the left, rad
-    elevation: Float[np.ndarray, " n"]  # Angle above the tunnel's axis, rad
-
-
 @per_hold
-def beam_directions(case: Case) -> BeamDirections:
+def beam_directions(case: Case) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Return azimuth to the left, and elevation, of every returned beam from the tunnel's axis at the sensor, rad."""
     real, path = returns(case), sensor_path(case)
     _, starts = np.unique(real.scan, return_index=True)
     tangent, left, up = path.frames(path.local(real.origin[starts])[:, 0])[1:]
     number = np.searchsorted(real.scan[starts], real.scan)
     ahead, aside, above = (np.einsum("ij,ij->i", axis[number], real.direction) for axis in (tangent, left, up))
-    return BeamDirections(np.arctan2(aside, ahead), np.arcsin(np.clip(above, -1.0, 1.0)))
+    return np.arctan2(aside, ahead), np.arcsin(np.clip(above, -1.0, 1.0))
 
 
 @per_case
@@ -238,11 +222,9 @@ def scan_descriptors(case: Case) -> tuple[Float[np.ndarray, "s d"], Float[np.nda
     A descriptor holds quantiles of the ranges and their median in sectors of azimuth and elevation, in log metres; a
     sector without beams in either holds the scan's median.
     """
-    real, angles = returns(case), beam_directions(case)
-    reach = noisy_ranges(case, "first")
-    both = np.isfinite(reach)
-    sector = np.zeros(len(reach), int)
-    for angle, count in zip((angles.azimuth, angles.elevation), _DIRECTION_SECTORS, strict=True):
+    real, reach = returns(case), noisy_ranges(case, "first")
+    both, sector = np.isfinite(reach), np.zeros(len(reach), int)
+    for angle, count in zip(beam_directions(case), _DIRECTION_SECTORS, strict=True):
         edges = np.quantile(angle, np.linspace(0.0, 1.0, count + 1)[1:-1])
         sector = sector * count + np.searchsorted(edges, angle)
     rows: list[tuple[np.ndarray, np.ndarray]] = []

@@ -245,7 +245,7 @@ _CLOSE_PAIR = 0.05  # m; two returns so near to each other differ by their noise
 class Patches:
     """Smooth pieces of wall in the held-out recording."""
 
-    beam: Int[np.ndarray, "p k"]  # Numbers of the beams on each plane, -1 as padding
+    beam: Int[np.ndarray, "p k"]  # Numbers of the returns on each plane, -1 as padding
     roughness: float  # Variance about the planes, noise taken off, m²; may come out below 0 where there is hardly any
     noise: float  # Variance of the returns along the normals, m²
     resolved: bool  # True where the roughness stands out of its own standard error
@@ -258,12 +258,7 @@ class Patches:
 @per_hold
 def hold_patches(case: Case) -> Patches | None:
     """Return the patches of the held-out wall; `None` where its points lie too far apart."""
-    assert case.hold is not None
-    hold = case.hold
-    index = np.flatnonzero(hold.returned)
-    index = index[np.lexsort((hold.direction[index, 2], hold.time[index]))]  # the same planes in whatever order
-    points = hold.origin[index] + hold.range[index, None] * hold.direction[index]
-    points -= np.floor(points.mean(axis=0))
+    points = returns(case).points - np.floor(returns(case).points.mean(axis=0))
     tree = cKDTree(points)
     seeds = case.rng("tri_roughness_ratio").permutation(len(points))[: 4 * _MOST_PATCHES]
     distance, near = tree.query(points[seeds], k=_PATCH_MOST, distance_upper_bound=_PATCH_RADIUS)
@@ -279,15 +274,14 @@ def hold_patches(case: Case) -> Patches | None:
     if smooth.sum() < _FEWEST_PATCHES:
         return None
     near, inside, normal, away = near[smooth], inside[smooth], normal[smooth], away[smooth]
-    whole, noise = _patch_variance(away, inside), _return_noise(points[np.where(inside, near, 0)], inside, normal, away)
+    whole, noise = _patch_variance(away, inside), _return_noise(points[np.where(inside, near, 0)], inside, normal)
     judged = np.isfinite(noise)
     if judged.sum() < _FEWEST_PATCHES:
         return None
     excess = (whole - noise)[judged]
     middle = float(np.median(excess))
     error = _MEDIAN_ERROR * float(np.median(np.abs(excess - middle))) / np.sqrt(len(excess))
-    beam = np.where(inside, index[np.where(inside, near, 0)], -1)[judged]
-    return Patches(beam, middle, float(np.median(noise[judged])), middle > 2.0 * error)
+    return Patches(np.where(inside, near, -1)[judged], middle, float(np.median(noise[judged])), middle > 2.0 * error)
 
 
 def lining_roughness(case: Case) -> float:
@@ -295,18 +289,17 @@ def lining_roughness(case: Case) -> float:
     patches = hold_patches(case)
     if patches is None:
         return float("nan")
-    assert case.hold is not None
-    beam = np.unique(patches.beam[patches.beam >= 0])
-    origin, direction = case.hold.origin[beam] - weld_offset(case), case.hold.direction[beam]
-    distance = np.full(len(case.hold.range), np.nan)
-    distance[beam] = first_hits(welded_lining(case), origin, direction)[1]
+    real, beam = returns(case), np.unique(patches.beam[patches.beam >= 0])
+    distance = np.full(len(real.range), np.nan)
+    origin = real.origin[beam] - weld_offset(case)
+    distance[beam] = first_hits(welded_lining(case), origin, real.direction[beam])[1]
     # A beam that meets something else than the wall says nothing about its roughness.
-    distance[np.abs(distance - case.hold.range) > 0.5] = np.nan
+    distance[np.abs(distance - real.range) > 0.5] = np.nan
     reach = np.where(patches.beam >= 0, distance[patches.beam], np.nan)
     inside = np.isfinite(reach)
     full = inside.sum(axis=1) >= _PATCH_LEAST
     patch, inside, reach = patches.beam[full], inside[full], reach[full]
-    hit = case.hold.origin[patch] + np.nan_to_num(reach)[..., None] * case.hold.direction[patch]
+    hit = real.origin[patch] + np.nan_to_num(reach)[..., None] * real.direction[patch]
     return float(np.median(_patch_variance(_patch_planes(hit - hit[:, :1], inside)[1], inside)))
 
 
@@ -324,7 +317,7 @@ def _patch_variance(away: Float[np.ndarray, "p k"], inside: np.ndarray) -> Float
 
 
 def _return_noise(
-    points: Float[np.ndarray, "p k 3"], inside: np.ndarray, normal: Float[np.ndarray, "p 3"], away: np.ndarray
+    points: Float[np.ndarray, "p k 3"], inside: np.ndarray, normal: Float[np.ndarray, "p 3"]
 ) -> Float[np.ndarray, " p"]:
     """Estimates the variance of one return along the normal, from close pairs in the plane, m²; NaN without."""
     points = np.where(inside[..., None], points - points[:, :1], 1e3 * (1.0 + np.arange(points.shape[1]))[:, None])

@@ -32,14 +32,6 @@ class MeshDistances:
     sector: Int[np.ndarray, " n"]  # One of eight about the candidate's axis: 0 to its left, 2 its crown, 6 its floor
 
 
-@dataclass(frozen=True)
-class CloudDistances:
-    """Distances of observed samples of the candidate to the held-out points."""
-
-    distance: Float[np.ndarray, " n"]  # Distance to the nearest held-out point, m
-    station: Float[np.ndarray, " n"]  # Station along the sensor's path, m
-
-
 @kept_until("DEG", per_hold)
 def thinned_rows(case: Case) -> Int[np.ndarray, " k"]:
     """Return the numbers of at most `MOST_POINTS` returns, evenly spaced in time."""
@@ -67,9 +59,10 @@ def mean_distance(case: Case, other: Hold) -> float:
 
 
 @per_case
-def cloud_distances(case: Case) -> CloudDistances:
-    """Return the distances of samples, one in 10 cm, that a held-out beam cast in the candidate would have hit.
+def cloud_distances(case: Case) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Return distance to the nearest held-out point, and station along the sensor's path, of observed samples, m.
 
+    Samples of the candidate, one in 10 cm, are those that a held-out beam cast in the candidate would have hit.
     A sample counts as observed if a beam hits the candidate within 5 cm of it at less than 80° of incidence; half the
     smallest tolerance, so that a return that is there is within reach of it.
     """
@@ -83,12 +76,10 @@ def cloud_distances(case: Case) -> CloudDistances:
     gap, _ = cKDTree(hits, balanced_tree=False).query(samples, distance_upper_bound=0.05)
     samples = samples[np.isfinite(gap)]
     local = beams.sensor_path(case).local(samples)
-    _, even = np.unique(
-        surface.cell_numbers(local, _MESH_CELL), return_index=True
-    )  # small triangles have too many samples
+    # Small triangles have too many samples.
+    even = np.unique(surface.cell_numbers(local, _MESH_CELL), return_index=True)[1]
     even = even[np.linspace(0, len(even) - 1, min(len(even), MOST_POINTS)).astype(int)]
-    distance, _ = beams.cloud_tree(case).query(samples[even])
-    return CloudDistances(distance, local[even, 0])
+    return beams.cloud_tree(case).query(samples[even])[0], local[even, 0]
 
 
 # Cells of the surface that held-out beams pass through.
@@ -106,9 +97,8 @@ def phantom_cells(case: Case) -> Bool[np.ndarray, " c"]:
     """
     cast = beams.cast_beams(case)
     observed = cast.cosine > STEEPEST
-    _, cell = np.unique(
-        surface.cell_numbers(beams.local_at(case, cast.range)[observed], _OBSERVED_CELL), return_inverse=True
-    )
+    number = surface.cell_numbers(beams.local_at(case, cast.range)[observed], _OBSERVED_CELL)
+    cell = np.unique(number, return_inverse=True)[1]
     crossed = np.bincount(cell, cast.difference[observed] < -_EARLY)
     return crossed > 0.5 * np.bincount(cell)
 
@@ -125,11 +115,9 @@ def density_aware_chamfer(case: Case) -> float:
     Source: Wu et al. 2021, arXiv 2111.12702, eq. 6: ½ Σ over both of the mean of 1 - exp(-α d) / n, with n the
     number of points that share the nearest neighbour.
     """
-    edge, hit = _THIN, beams.cast_beams(case).hit
-    clouds = [
-        points[np.unique(surface.cell_numbers(points, edge), return_index=True)[1]]
-        for points in (beams.returns(case).local, beams.local_at(case, beams.cast_beams(case).range)[hit])
-    ]
+    cast = beams.cast_beams(case)
+    both = beams.returns(case).local, beams.local_at(case, cast.range)[cast.hit]
+    clouds = [points[np.unique(surface.cell_numbers(points, _THIN), return_index=True)[1]] for points in both]
     return 0.5 * (_one_way(clouds[0], clouds[1]) + _one_way(clouds[1], clouds[0]))
 
 
@@ -203,24 +191,20 @@ PAPER_SIGMA = 0.05  # m: the range noise that the paper states for its LiDAR
 _MOST_SELF_CAST = 30_000
 
 
-@dataclass(frozen=True)
-class SelfCast:
-    """Distances of a noisy cloud to the mesh that it was cast in."""
-
-    distance: Float[np.ndarray, " n"]  # Distance to the mesh, m
-    noise_alone: float  # σ·√(2/π)·mean|cos incidence|, m: the mean distance that noise gives on planes
-
-
 @per_case
-def self_cast(case: Case) -> SelfCast:
-    """Casts a noisy cloud at the held-out beams and measures it against the same mesh; any mesh passes."""
+def self_cast(case: Case) -> tuple[Float[np.ndarray, " n"], float]:
+    """Casts a noisy cloud at the held-out beams and measures it against the same mesh; any mesh passes.
+
+    Returns:
+        Distances to the mesh, and the mean that noise alone gives on planes: σ·√(2/π)·mean|cos incidence|, m.
+    """
     real, cast = beams.returns(case), beams.cast_beams(case)
     pick = thinned_rows(case)
     pick = pick[cast.hit[pick]]
     pick = pick[:: max(len(pick) // _MOST_SELF_CAST, 1)]
     reach = cast.range[pick] + PAPER_SIGMA * case.rng("selfcast").standard_normal(len(pick))
     distance, _, _ = surface.surface_nearest(case).query(real.origin[pick] + reach[:, None] * real.direction[pick])
-    return SelfCast(distance, float(PAPER_SIGMA * np.sqrt(2.0 / np.pi) * np.mean(cast.cosine[pick])))
+    return distance, float(PAPER_SIGMA * np.sqrt(2.0 / np.pi) * np.mean(cast.cosine[pick]))
 
 
 # Occupied voxels in station, left and up along the sensor's path.
@@ -257,17 +241,14 @@ class Occupied:
 @kept_until("OCC", per_case)
 def occupied_voxels(case: Case) -> Occupied:
     """Return the voxels of held-out and synthetic points, and the known voxels near them."""
-    edge = VOXEL_EDGE
-    real = beams.returns(case)
-    clouds = [_count_points(real.local, edge)]
-    for draw in ("first", "second"):
-        clouds.append(_count_points(beams.local_at(case, beams.noisy_ranges(case, draw)), edge))
+    locals_ = [beams.local_at(case, beams.noisy_ranges(case, draw)) for draw in ("first", "second")]
+    clouds = [_count_points(local) for local in (beams.returns(case).local, *locals_)]
     both = np.concatenate([index for index, _ in clouds[:2]])
     low, high = both.min(axis=0) - SHELL_VOXELS - 1, both.max(axis=0) + SHELL_VOXELS + 2
     points = np.stack([_fill_grid(index, count, low, high) for index, count in clouds])
     free = free_voxels(case)
     known = (points[0] > 0) | (points[1] > 0) | (_fill_grid(free, np.ones(len(free), np.int32), low, high) > 0)
-    return Occupied(points, known, (np.arange(low[0], high[0]) + 0.5) * edge)
+    return Occupied(points, known, (np.arange(low[0], high[0]) + 0.5) * VOXEL_EDGE)
 
 
 @kept_until("DEG", per_hold)
@@ -275,10 +256,9 @@ def free_voxels(case: Case) -> Int[np.ndarray, "n 3"]:
     """Return the indices of voxels that held-out beams passed in the last metres before their returns."""
     real = beams.returns(case)
     pick = np.linspace(0, len(real.range) - 1, min(len(real.range), _FREE_RAYS)).astype(int)
-    edge = VOXEL_EDGE
-    before = np.arange(edge, _FREE_LENGTH, _BEAM_STEP)
+    before = np.arange(VOXEL_EDGE, _FREE_LENGTH, _BEAM_STEP)
     steps = (real.local[pick] - back * real.heading[pick] for back in before)
-    return np.unique(np.concatenate([_count_points(step, edge)[0] for step in steps]), axis=0)
+    return np.unique(np.concatenate([_count_points(step)[0] for step in steps]), axis=0)
 
 
 def dilate(grid: Bool[np.ndarray, "..."], by: int = 1) -> Bool[np.ndarray, "..."]:
@@ -322,11 +302,11 @@ def tolerant_f1(grids: Occupied, group: Int[np.ndarray, " i"]) -> Float[np.ndarr
     return 2.0 * precision * recall / np.maximum(precision + recall, 1e-12)
 
 
-def _count_points(local: Float[np.ndarray, "n 3"], edge: float) -> tuple[Int[np.ndarray, "v 3"], Int[np.ndarray, " v"]]:
+def _count_points(local: Float[np.ndarray, "n 3"]) -> tuple[Int[np.ndarray, "v 3"], Int[np.ndarray, " v"]]:
     """Return the voxels with a point near the path, and the number of their points."""
     near = local[(np.abs(local[:, 1:]) < _AROUND_PATH).all(axis=1)]
-    _, first, count = np.unique(surface.cell_numbers(near, edge), return_index=True, return_counts=True)
-    return np.floor(near[first] / edge).astype(np.int64), count
+    _, first, count = np.unique(surface.cell_numbers(near, VOXEL_EDGE), return_index=True, return_counts=True)
+    return np.floor(near[first] / VOXEL_EDGE).astype(np.int64), count
 
 
 def _fill_grid(

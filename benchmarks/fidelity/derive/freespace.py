@@ -73,14 +73,17 @@ class Lattice:
     shape: tuple[int, int, int]  # Number of cells each way
     edge: float  # Edge of a cell, m
 
+    def axes(self) -> list[np.ndarray]:
+        """Return the middles of the cells along station, left and up, m."""
+        return [low + self.edge * (np.arange(n) + 0.5) for low, n in zip(self.low, self.shape, strict=True)]
+
     def local(self) -> Float[np.ndarray, "k 3"]:
         """Return the middles of all cells: station, left, up, m."""
-        axes = [low + self.edge * (np.arange(n) + 0.5) for low, n in zip(self.low, self.shape, strict=True)]
-        return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+        return np.stack(np.meshgrid(*self.axes(), indexing="ij"), axis=-1).reshape(-1, 3)
 
     def points(self) -> Float[np.ndarray, "k 3"]:
         """Return the middles of all cells in the tunnel frame, m."""
-        axes = [low + self.edge * (np.arange(n) + 0.5) for low, n in zip(self.low, self.shape, strict=True)]
+        axes = self.axes()
         position, _, left, up = (a[:, None, None] for a in self.curve.frames(axes[0]))
         placed = position + axes[1][None, :, None, None] * left + axes[2][None, None, :, None] * up
         return placed.reshape(-1, 3)
@@ -130,8 +133,7 @@ def air_voxels(case: Case) -> Air:
     cells = air_lattice(case)
     inside = (lining_radii(case).depth(cells.points()) > 0).reshape(cells.shape)
     track = cells.marked(cells.curve.local(track_points(case, cells.edge)))
-    extra = cells.marked(cells.curve.local(sample_surface(case.candidate.extra, cells.edge / 2)[0]))
-    judged = reachable(inside & ~track & ~extra)
+    judged = reachable(inside & ~cells.marked(cells.curve.local(object_points(case, cells.edge))))
     reference, known = reference_air(case)
     return Air(cells, judged, reference, known, inside & ~judged, inside & ~judged & ~track)
 
@@ -192,10 +194,8 @@ def reachable(free: Bool[np.ndarray, "n m k"]) -> Bool[np.ndarray, "n m k"]:
     if not count:
         return free
     rows = np.flatnonzero(free.any(axis=tuple(range(1, free.ndim))))
-    ends = np.concatenate(
-        [part[rows[0] : rows[0] + _MOUTH_VOXELS].ravel(), part[rows[-1] - _MOUTH_VOXELS + 1 : rows[-1] + 1].ravel()]
-    )
-    cells = np.bincount(ends, minlength=count + 1)
+    ends = part[rows[0] : rows[0] + _MOUTH_VOXELS], part[rows[-1] - _MOUTH_VOXELS + 1 : rows[-1] + 1]
+    cells = np.bincount(np.concatenate([end.ravel() for end in ends]), minlength=count + 1)
     cells[0] = 0
     return np.isin(part, np.flatnonzero(cells > 0.1 * cells.max()))
 
@@ -226,15 +226,6 @@ _VEHICLE_FLOOR = 0.45  # m; where its envelope begins
 _TIGHTER = (0.0, 0.05, 0.10)  # m that the reference's own median outline is drawn in
 
 
-@dataclass(frozen=True)
-class Clearances:
-    """Distances to the nearest surface around the axis."""
-
-    station: Float[np.ndarray, " n"]  # Stations of the sections, m
-    judged: Float[np.ndarray, "n k"]  # judged, reference: Distances by section and place in it, m
-    reference: Float[np.ndarray, "n k"]
-
-
 def _places_near_axis(case: Case) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "k 3"]]:
     station = sections(case).station
     offset = np.arange(-_AROUND_AXIS, _AROUND_AXIS + 1e-9, _NODE)
@@ -249,11 +240,14 @@ def _reference_clearances(case: Case) -> Float[np.ndarray, " k"]:
 
 
 @per_case
-def axis_clearances(case: Case) -> Clearances:
-    """Return the clearances of candidate and reference; a recording's is the distance to its nearest return."""
+def axis_clearances(case: Case) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n k"], Float[np.ndarray, "n k"]]:
+    """Return stations, and distances to the nearest surface around the axis, m, of candidate and reference.
+
+    They are by section and place in it; a recording's is the distance to its nearest return.
+    """
     station, points = _places_near_axis(case)
-    both = surface_nearest(case).query(points)[0], _reference_clearances(case)
-    return Clearances(station, *(distance.reshape(len(station), -1) for distance in both))
+    judged, reference = surface_nearest(case).query(points)[0], _reference_clearances(case)
+    return station, judged.reshape(len(station), -1), reference.reshape(len(station), -1)
 
 
 @per_case

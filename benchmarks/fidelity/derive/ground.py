@@ -37,7 +37,6 @@ _LEVELS = (0.3, 0.7)  # m above the ground at which the robot would run into som
 class Ground:
     """Ground under the robot and headroom over it, in cells whose middles lie closer across than a cell is wide."""
 
-    cell: float  # Edge of a cell, m
     station: Float[np.ndarray, " n"]  # Stations of the rows, one cell apart, m
     left: Float[np.ndarray, " m"]  # Offsets of the columns, m
     height: Float[np.ndarray, "n m"]  # Height of the ground above the axis, m; NaN where none is seen
@@ -63,18 +62,15 @@ class Ground:
     @property
     def clearance(self) -> Float[np.ndarray, "n m"]:
         """Distance to the nearest cell that is not traversable, m; the mouths are open."""
-        free = self.traversable
-        apart = (self.cell, self.spacing)
+        free, apart = self.traversable, (GROUND_CELL, self.spacing)
         return distance_transform_edt(free, apart) if not free.all() else np.full(free.shape, GROUND_HALF)
 
     def lattices(self) -> "list[Ground]":
         """Return the grounds of cells side by side that this one is made of."""
         return [
-            Ground(self.cell, self.station, self.left[k::LATTICES], *(
-                grid[:, k::LATTICES] for grid in (self.height, self.headroom, self.step)
-            ))
+            Ground(self.station, *(a[..., k::LATTICES] for a in (self.left, self.height, self.headroom, self.step)))
             for k in range(LATTICES)
-        ]  # fmt: skip
+        ]
 
 
 def ground_curve(case: Case) -> Curve:
@@ -82,33 +78,31 @@ def ground_curve(case: Case) -> Curve:
     return lining_curve(case) if case.truth is None and case.hold is None else reference_curve(case)
 
 
-def ground_axes(curve: Curve, cell: float) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " m"]]:
-    station = curve.station[0] + MOUTH_MARGIN + cell * (np.arange(int((curve.length - 2 * MOUTH_MARGIN) / cell)) + 0.5)
+def _ground_axes(curve: Curve) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " m"]]:
+    cell, length = GROUND_CELL, curve.length - 2 * MOUTH_MARGIN
     columns = LATTICES * int(GROUND_HALF / cell)
-    return station, cell / LATTICES * np.arange(-columns, columns + 1)
+    return (
+        curve.station[0] + MOUTH_MARGIN + cell * (np.arange(int(length / cell)) + 0.5),
+        cell / LATTICES * np.arange(-columns, columns + 1),
+    )
 
 
 @kept_until("NAV", per_case)
 def judged_ground(case: Case) -> Ground:
-    return _cast_ground(ground_curve(case), GROUND_CELL, surface_caster(case), lining_radii(case))
+    return _cast_ground(ground_curve(case), surface_caster(case), lining_radii(case))
 
 
-def _cast_ground(curve: Curve, cell: float, caster: Caster, radii: Radii) -> Ground:
-    station, left = ground_axes(curve, cell)
+def _cast_ground(curve: Curve, caster: Caster, radii: Radii) -> Ground:
+    station, left = _ground_axes(curve)
     rows = max(_RAYS_AT_ONCE // len(left), 1)
-    parts = [_cast_rows(curve, cell, caster, radii, station[k : k + rows], left) for k in range(0, len(station), rows)]
+    parts = [_cast_rows(curve, caster, radii, station[k : k + rows], left) for k in range(0, len(station), rows)]
     highest, lowest, barred = (np.concatenate(grids) for grids in zip(*parts, strict=True))
     step = np.where(barred, np.inf, cell_steps(highest, LATTICES))
-    return Ground(cell, station, left, highest, lowest - highest, step)
+    return Ground(station, left, highest, lowest - highest, step)
 
 
 def _cast_rows(
-    curve: Curve,
-    cell: float,
-    caster: Caster,
-    radii: Radii,
-    station: Float[np.ndarray, " n"],
-    left: Float[np.ndarray, " m"],
+    curve: Curve, caster: Caster, radii: Radii, station: Float[np.ndarray, " n"], left: Float[np.ndarray, " m"]
 ) -> tuple[Float[np.ndarray, "n m"], Float[np.ndarray, "n m"], Bool[np.ndarray, "n m"]]:
     """Return the highest ground and lowest roof of cells, m, and True where something upright bars one.
 
@@ -116,24 +110,23 @@ def _cast_rows(
     narrower than it.
     """
     position, _, across, up = curve.frames(station)
-    fine = cell / LATTICES * (np.arange(len(left) + LATTICES - 1) - (LATTICES - 1) / 2) + left[0]
+    fine = GROUND_CELL / LATTICES * (np.arange(len(left) + LATTICES - 1) - (LATTICES - 1) / 2) + left[0]
     eye = (position[:, None] + fine[None, :, None] * across[:, None] + _EYE_HEIGHT * up[:, None]).reshape(-1, 3)
     inside = radii.depth(eye) > 0
     upward = np.repeat(up, len(fine), axis=0)
-    height, roof = (
-        sliding_window_view(
-            _ray_heights(caster, eye, sign * upward, inside, sign).reshape(len(station), -1), LATTICES, 1
-        )
-        for sign in (-1, 1)
-    )
-    highest, lowest = height.max(axis=2), roof.min(axis=2)
-    return highest, lowest, _barred_cells(caster, curve, cell, station, left, highest)
+    ends = []
+    for sign in (-1, 1):
+        reach = np.full(len(eye), np.nan)
+        reach[inside] = caster.first(eye[inside], sign * upward[inside])[0]
+        height = np.where(np.isfinite(reach), _EYE_HEIGHT + sign * reach, np.nan).reshape(len(station), -1)
+        ends.append(sliding_window_view(height, LATTICES, 1))
+    highest, lowest = ends[0].max(axis=2), ends[1].min(axis=2)
+    return highest, lowest, _barred_cells(curve, caster, station, left, highest)
 
 
 def _barred_cells(
-    caster: Caster,
     curve: Curve,
-    cell: float,
+    caster: Caster,
     station: Float[np.ndarray, " n"],
     left: Float[np.ndarray, " m"],
     height: Float[np.ndarray, "n m"],
@@ -147,21 +140,8 @@ def _barred_cells(
         eye = (position[:, None] + left[:, None] * across[:, None] + rise)[known]
         for ahead in (tangent, -tangent):
             towards = np.broadcast_to(ahead[:, None], (*height.shape, 3))[known]
-            barred[known] |= caster.first(eye, towards)[0] < cell
+            barred[known] |= caster.first(eye, towards)[0] < GROUND_CELL
     return barred
-
-
-def _ray_heights(
-    caster: Caster,
-    eye: Float[np.ndarray, "k 3"],
-    direction: Float[np.ndarray, "k 3"],
-    among: Bool[np.ndarray, " k"],
-    sign: int,
-) -> Float[np.ndarray, " k"]:
-    """Return the height above the axis at which rays up or down end, m; NaN where they do not."""
-    reach = np.full(len(eye), np.nan)
-    reach[among] = caster.first(eye[among], direction[among])[0]
-    return np.where(np.isfinite(reach), _EYE_HEIGHT + sign * reach, np.nan)
 
 
 def cell_steps(height: Float[np.ndarray, "n m"], apart: int = 1) -> Float[np.ndarray, "n m"]:
@@ -171,13 +151,10 @@ def cell_steps(height: Float[np.ndarray, "n m"], apart: int = 1) -> Float[np.nda
         height: Heights of cells, m, `(n, m)`.
         apart: Columns from a cell to the one beside it.
     """
-    padded = np.pad(height, ((1, 1), (0, 0)), mode="edge")
-    padded = np.pad(padded, ((0, 0), (apart, apart)), constant_values=np.nan)
-    inner = padded[1:-1, apart:-apart]
-    shifted = (
-        padded[2:, apart:-apart], padded[:-2, apart:-apart], padded[1:-1, 2 * apart :], padded[1:-1, : -2 * apart],
-    )  # fmt: skip
-    return np.max([np.abs(inner - other) for other in shifted], axis=0)
+    along = np.pad(height, ((1, 1), (0, 0)), mode="edge")
+    aside = np.pad(height, ((0, 0), (apart, apart)), constant_values=np.nan)
+    others = along[2:], along[:-2], aside[:, 2 * apart :], aside[:, : -2 * apart]
+    return np.max([np.abs(height - other) for other in others], axis=0)
 
 
 # The two grounds to compare: by rays against the truth, by the same beams against a recording.
@@ -199,8 +176,7 @@ def both_grounds(case: Case) -> tuple[Ground, Ground]:
     The last 25 cm before the reference's wall are left out: the robot's middle cannot get there.
     """
     judged = judged_ground(case) if case.truth is not None else _observed_ground(case)
-    reference = _reference_ground(case)
-    cut = sections(case)
+    reference, cut = _reference_ground(case), sections(case)
     low = shapely.bounds(cut.reference_outline)[:, 1] + _WALL_FOOT
     reach = np.interp(reference.station, cut.station, widths(cut.reference_outline, low) / 2 - _WALL_MARGIN)
     off = np.abs(reference.left) > reach[:, None]
@@ -210,34 +186,33 @@ def both_grounds(case: Case) -> tuple[Ground, Ground]:
 
 def _observed_ground(case: Case) -> Ground:
     curve, points = reference_curve(case), synthetic_points(case)
-    return _ground_of_points(curve, GROUND_CELL, curve.local(points[np.isfinite(points).all(axis=1)]))
+    return _ground_of_points(curve, curve.local(points[np.isfinite(points).all(axis=1)]))
 
 
 @kept_until("NAV", per_reference)
 def _reference_ground(case: Case) -> Ground:
-    cell = GROUND_CELL
     if case.truth is None:
-        return _ground_of_points(hold_curve(case), cell, hold_local(case))
-    return _cast_ground(ground_curve(case), cell, truth_caster(case), truth_radii(case))
+        return _ground_of_points(hold_curve(case), hold_local(case))
+    return _cast_ground(ground_curve(case), truth_caster(case), truth_radii(case))
 
 
-def _ground_of_points(curve: Curve, cell: float, local: Float[np.ndarray, "k 3"]) -> Ground:
-    station, left = ground_axes(curve, cell)
+def _ground_of_points(curve: Curve, local: Float[np.ndarray, "k 3"]) -> Ground:
+    station, left = _ground_axes(curve)
     low = local[local[:, 2] < _FLOOR_BELOW]
     height, step = np.empty((len(station), len(left))), np.empty((len(station), len(left)))
     for k in range(LATTICES):
         beside = slice(k, None, LATTICES)
-        height[:, beside] = _heights_of_points(station, left[beside], cell, low)
+        height[:, beside] = _heights_of_points(station, left[beside], low)
         step[:, beside] = cell_steps(height[:, beside])
-    return Ground(cell, station, left, height, np.where(np.isfinite(height), np.inf, np.nan), step)
+    return Ground(station, left, height, np.where(np.isfinite(height), np.inf, np.nan), step)
 
 
 def _heights_of_points(
-    station: Float[np.ndarray, " n"], left: Float[np.ndarray, " m"], cell: float, low: Float[np.ndarray, "k 3"]
+    station: Float[np.ndarray, " n"], left: Float[np.ndarray, " m"], low: Float[np.ndarray, "k 3"]
 ) -> Float[np.ndarray, "n m"]:
     """Return the heights of cells side by side, m, from returns of the ground; NaN far from any return."""
-    row = np.floor((low[:, 0] - station[0]) / cell + 0.5).astype(int)
-    column = np.round((low[:, 1] - left[0]) / cell).astype(int)
+    row = np.floor((low[:, 0] - station[0]) / GROUND_CELL + 0.5).astype(int)
+    column = np.round((low[:, 1] - left[0]) / GROUND_CELL).astype(int)
     spread = np.concatenate([row + shift for shift in _ROW_SPREAD])
     column, above = np.tile(column, len(_ROW_SPREAD)), np.tile(low[:, 2], len(_ROW_SPREAD))
     kept = (spread >= 0) & (spread < len(station)) & (column >= 0) & (column < len(left))
@@ -288,7 +263,7 @@ def find_route(ground: Ground) -> Route | None:
     if part[start] != part[goal]:
         return None
     cost = np.where(fits, 1.0 / np.maximum(clearance, 1e-3) ** 2, _BARRED)
-    search = MCP_Geometric(cost, sampling=(ground.cell, ground.spacing))
+    search = MCP_Geometric(cost, sampling=(GROUND_CELL, ground.spacing))
     search.find_costs([start], [goal])
     cells = np.asarray(search.traceback(goal))
     place = np.column_stack([ground.station[cells[:, 0]], ground.left[cells[:, 1]]])
@@ -296,9 +271,8 @@ def find_route(ground: Ground) -> Route | None:
 
 
 def _nearest_to_axis(ground: Ground, fits: Bool[np.ndarray, "n m"], end: int) -> tuple[int, int] | None:
-    rows = range(int(_ROUTE_ENDS / ground.cell)) if end == 0 else range(-1, -1 - int(_ROUTE_ENDS / ground.cell), -1)
-    between = np.abs(ground.left) < GAUGE_HALF
-    for row in rows:
+    count, between = int(_ROUTE_ENDS / GROUND_CELL), np.abs(ground.left) < GAUGE_HALF
+    for row in range(count) if end == 0 else range(-1, -1 - count, -1):
         columns = np.flatnonzero(fits[row] & between)
         if len(columns):
             return row % len(fits), int(columns[np.argmin(np.abs(ground.left[columns]))])

@@ -34,7 +34,7 @@ class Plane:
     @property
     def station(self) -> Float[np.ndarray, " n"]:
         """Stations of the rows, m."""
-        return self.lattice.low[0] + self.lattice.edge * (np.arange(self.lattice.shape[0]) + 0.5)
+        return self.lattice.axes()[0]
 
 
 def sensor_height(case: Case) -> float:
@@ -56,12 +56,9 @@ def free_plane(case: Case) -> Plane:
         free, known = _cells_near_plane(case, cells)
         return Plane(cells, judged, free, known, height)
     inside = (truth_radii(case).depth_local(cells.local()) > 0).reshape(cells.shape[:2])
-    free = freespace.reachable(
-        inside & ~cells.marked(cells.curve.local(freespace.true_object_points(case, cells.edge)))[..., 0]
-    )
-    return Plane(
-        cells, judged, free, binary_dilation(inside, iterations=int(freespace.KNOWN_AROUND / cells.edge)), height
-    )
+    objects = cells.marked(cells.curve.local(freespace.true_object_points(case, cells.edge)))[..., 0]
+    known = binary_dilation(inside, iterations=int(freespace.KNOWN_AROUND / cells.edge))
+    return Plane(cells, judged, freespace.reachable(inside & ~objects), known, height)
 
 
 def _cells_near_plane(case: Case, cells: freespace.Lattice) -> tuple[Bool[np.ndarray, "n m"], Bool[np.ndarray, "n m"]]:
@@ -91,7 +88,7 @@ def gapless_maps(case: Case) -> tuple[Bool[np.ndarray, "r m"], Bool[np.ndarray, 
         return both.judged, both.reference, both.station
     wall = _wall_distances(hold_local(case), both)
     rows = np.isfinite(wall).all(axis=0)
-    left = both.lattice.low[1] + both.lattice.edge * (np.arange(both.lattice.shape[1]) + 0.5)
+    left = both.lattice.axes()[1]
     free = (left < wall[0, rows, None]) & (left > -wall[1, rows, None])
     return both.judged[rows], free, both.station[rows]
 

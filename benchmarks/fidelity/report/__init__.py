@@ -6,7 +6,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from jinja2 import Environment, FileSystemLoader
 
 from benchmarks.fidelity import judge, outside, scoring, table
@@ -15,7 +14,6 @@ from benchmarks.fidelity.faults.kinds import suite_controls
 from benchmarks.fidelity.files import write_csv, write_json, write_text
 from benchmarks.fidelity.inputs import Inputs
 from benchmarks.fidelity.judge import Judgement
-from benchmarks.fidelity.registry import BLOCK, Value
 from benchmarks.fidelity.report.figures import Sheet, draw_all
 from benchmarks.fidelity.scoring import Score, Scored
 from benchmarks.fidelity.table import Metric
@@ -128,18 +126,7 @@ def _metric_entry(row: Metric, scored: dict[str, Scored]) -> dict[str, Any]:
         "ci95": value.interval, "n": value.n, "score": score.score, "role": row.role, "evidence": row.evidence,
         "map": str(row.map), "null_value": null, "ceiling_value": ceiling,
         "skill": scoring.skill(value.value, null, ceiling), "status": _status(row, score), "reason": value.reason,
-        "worst_stretch": _worst_stretch(row, value),
     }  # fmt: skip
-
-
-def _worst_stretch(row: Metric, value: Value) -> dict[str, float | None] | None:
-    """Return start and end, m, value and score of the 10 m in which a metric is worst; `None` without any."""
-    if value.extremes is None:
-        return None
-    scores = [row.map.score(one) if row.scored else 0.0 for _, one in value.extremes]
-    worst = int(np.argmin(scores)) if row.scored and scores[0] != scores[1] else int(not row.rises)
-    start, found = value.extremes[worst]
-    return {"start": start, "end": start + BLOCK, "value": found, "score": scores[worst] if row.scored else None}
 
 
 def _outside_entry(judgement: Judgement) -> dict[str, Any] | None:
@@ -219,8 +206,7 @@ def write_report(
 
 HERE = Path(__file__).parent
 METRIC_COLUMNS = ("id", "category", "value", "unit", "score", "role", "evidence", "status", "ci_low", "ci_high", "n",
-                  "null_value", "ceiling_value", "skill", "map",
-                  "worst_start", "worst_value", "worst_score", "reason")  # fmt: skip
+                  "null_value", "ceiling_value", "skill", "map", "reason")  # fmt: skip
 
 
 def write_metrics(folder: Path, report: dict[str, Any]) -> Path:
@@ -232,8 +218,7 @@ def write_metrics(folder: Path, report: dict[str, Any]) -> Path:
     rows = []
     for entry in report["metrics"] + more:
         low, high = entry["ci95"] or (None, None)
-        worst = {f"worst_{key}": value for key, value in (entry["worst_stretch"] or {}).items()}
-        rows.append({"source": "suite", **entry, "ci_low": low, "ci_high": high, **worst})
+        rows.append({"source": "suite", **entry, "ci_low": low, "ci_high": high})
     columns = METRIC_COLUMNS + (("source",) if more else ())
     return write_csv(folder / "metrics.csv", columns, rows)
 

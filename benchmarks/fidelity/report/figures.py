@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.patches import Patch
 
-from benchmarks.fidelity import scoring
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.derive.beams import returns
 from benchmarks.fidelity.derive.curve import candidate_curve, cast_profile
@@ -22,7 +21,7 @@ from benchmarks.fidelity.derive.distances import VOXEL_EDGE, Occupied, occupied_
 from benchmarks.fidelity.derive.sections import truth_bore_caster
 from benchmarks.fidelity.table import Need
 from benchmarks.fidelity.windows.deviation import CELL, Unrolled, bore_caster
-from benchmarks.fidelity.windows.measures import Source, unrolled
+from benchmarks.fidelity.windows.judge import Source, unrolled
 
 matplotlib.use("Agg")
 
@@ -43,7 +42,7 @@ class Sheet:
 
 Drawn = tuple[Figure, str]
 Draw = Callable[[Sheet], Drawn | None]
-INK, BLUE, ORANGE, GREEN, RED, GREY = "#1b1b1b", "#0072b2", "#e69f00", "#009e73", "#d55e00", "#999999"
+INK, BLUE, RED = "#1b1b1b", "#0072b2", "#d55e00"
 AGREE, ONLY_MESH, ONLY_CLOUD = "#009e73", "#d55e00", "#0072b2"  # the paper's green, red and blue, for all eyes
 CLASSES = ListedColormap([AGREE, ONLY_MESH, ONLY_CLOUD])  # of a map of agreement
 DIVERGING = LinearSegmentedColormap.from_list("error", ["#0072b2", "#f7f7f7", "#d55e00"])
@@ -55,37 +54,6 @@ def show_map(axes: plt.Axes, values: Float[np.ndarray, "n m"], extent: Any, **st
     """Draws a map with the tunnel along x, as it is: no cell is blended with another."""
     style = {"aspect": "auto", "interpolation": "nearest"} | style
     return axes.imshow(values.T, origin="lower", extent=extent, **style)
-
-
-def draw_categories(sheet: Sheet) -> Drawn:
-    entries = sheet.report["categories"]
-    order = sorted(entries, key=lambda c: -1.0 if entries[c]["score"] is None else entries[c]["score"])
-    failed = {m["category"] for m in sheet.report["metrics"] if m["status"] == "gate failed"}
-    figure, axes = plt.subplots(figsize=(9, 5.6), layout="constrained")
-    for row, name in enumerate(order):
-        score, null, ceiling = (entries[name][key] for key in ("score", "null", "ceiling"))
-        if score is None:
-            axes.text(1, row, "no reference", va="center", color=GREY)
-        else:
-            axes.barh(row, score, height=0.62, color=RED if name in failed else BLUE)
-        if null is not None:
-            axes.plot(null, row, "D", color=GREY, markeredgecolor=INK, ms=6)
-        if ceiling is not None:
-            axes.plot(ceiling, row, "|", color=GREEN, ms=13, mew=2.5)
-    axes.axvline(scoring.PASS_CATEGORY, color=INK, lw=0.8, ls=":")
-    axes.set(yticks=range(len(order)), yticklabels=[f"{c}  {entries[c]['name']}" for c in order])
-    axes.set(xlim=(0, 103), ylim=(-0.7, len(order) - 0.3), xlabel="score")
-    line = plt.Line2D
-    marks = [
-        line([], [], color=BLUE, lw=7, label="reconstruction"),
-        line([], [], color=RED, lw=7, label="with a failed gate"),
-        line([], [], marker="D", ls="", color=GREY, markeredgecolor=INK, label="null tube"),
-        line([], [], marker="|", ls="", ms=13, mew=2.5, color=GREEN, label="truth as candidate"),
-    ]
-    axes.legend(handles=marks, loc="upper center", bbox_to_anchor=(0.4, -0.09), ncol=4, frameon=False)
-    scored = sum(m["score"] is not None for m in sheet.report["metrics"])
-    note = sheet.note(scored).replace("n =", "Scored metrics n =")
-    return figure, "Categories, sorted; dotted: least score for PASS." + note
 
 
 # Voxels of the bore's shell, and the voxels in which cloud and mesh disagree (the paper's Fig. 3).
@@ -248,41 +216,29 @@ def _stations(case: Case, one: Unrolled) -> np.ndarray:
 FIGURES: tuple[tuple[str, Draw, Need | None], ...] = (  # with the reference that each cannot do without
     ("unrolled", draw_unrolled, "reference"),
     ("worst-places", draw_worst_places, "reference"),
-    ("categories", draw_categories, None),
     ("voxels", draw_projections, "hold"),
     ("mismatch", draw_mismatch, "hold"),
 )
 
 
 def draw_all(folder: Path, sheet: Sheet) -> dict[str, tuple[Path, str]]:
-    """Writes each figure as PNG and SVG.
-
-    Returns:
-        PNG file and caption by name, in order.
-    """
+    """Writes each figure; returns its PNG file and caption by name, in order."""
     folder.mkdir(parents=True, exist_ok=True)
     written = {}
-    with plt.rc_context(
-        {"svg.hashsalt": "subterra", "font.size": 9, "axes.spines.top": False, "axes.spines.right": False}
-    ):
+    with plt.rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
         for name, draw, need in FIGURES:
             if not sheet.case.has(need):
                 continue
             try:
                 drawn = draw(sheet)
-            except (
-                Exception
-            ) as error:  # a recording that shows too little, or a corrupted candidate, costs its own figure
+            except Exception as error:  # a recording that shows too little costs its own figure
                 print(f"{name} is left out: {error}", flush=True)
                 plt.close("all")
                 continue
             if drawn is None:
                 continue
             figure, caption = drawn
-            for suffix in ("svg", "png"):
-                path = folder / f"{name}.{suffix}"
-                figure.savefig(path, dpi=130, metadata={"Date": None} if suffix == "svg" else None)
-                figure.set_layout_engine("none")  # laid out by the first: to do so takes as long as to draw
-            plt.close(figure)
             written[name] = (folder / f"{name}.png", caption)
+            figure.savefig(written[name][0], dpi=130)
+            plt.close(figure)
     return written

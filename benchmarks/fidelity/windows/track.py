@@ -1,7 +1,5 @@
 """Furniture by station: gauge, place and height of the rails, bed with sleepers, depth of the pockets."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -11,6 +9,7 @@ from benchmarks.fidelity.derive.curve import Curve, grouped_median, nanmedian, t
 from benchmarks.fidelity.derive.sections import truth_caster
 from benchmarks.fidelity.derive.surface import face_normals, surface_caster
 from benchmarks.fidelity.derive.track import gauge_along, sort_along, truth_railway
+from benchmarks.fidelity.registry import Samples
 from benchmarks.fidelity.windows.deviation import (
     COLUMNS,
     FINE,
@@ -31,15 +30,7 @@ _SOUND_FROM = 0.5  # m above the rails
 _RIM = 0.08  # m from the edge of a pocket to where the wall beside it is measured
 
 
-@dataclass(frozen=True)
-class Profile:
-    """Values along the tunnel."""
-
-    station: Float[np.ndarray, " n"]  # m
-    value: Float[np.ndarray, " n"]  # In the unit of its measure
-
-
-NOTHING = Profile(np.empty(0), np.empty(0))
+NOTHING = Samples(np.empty(0), np.empty(0))
 
 
 def has_rails(case: Case) -> bool:
@@ -61,18 +52,18 @@ def _true_gauge(case: Case) -> tuple[np.ndarray, np.ndarray]:
 
 
 @per_case
-def true_gauge_error(case: Case) -> Profile:
+def true_gauge_error(case: Case) -> Samples:
     """Return the gauge of the candidate less the true one, every half metre, m."""
     if not truth_railway(case).rail.shape[1] or not has_rails(case):
         return NOTHING
     track = case.candidate.track
     real = _true_gauge(case)
     station, gauge = gauge_along(truth_curve(case), track.rail_mesh, track.rail["left"], track.rail["right"])
-    return Profile(station, gauge - np.interp(station, *real))
+    return Samples(gauge - np.interp(station, *real), station)
 
 
 @per_case
-def true_rail_offsets(case: Case) -> tuple[Profile, Profile]:
+def true_rail_offsets(case: Case) -> tuple[Samples, Samples]:
     """Return the lateral offset of the track's middle, and the height of each rail over its true one, m."""
     real = truth_railway(case)
     if not real.rail.shape[1] or not has_rails(case):
@@ -85,12 +76,12 @@ def true_rail_offsets(case: Case) -> tuple[Profile, Profile]:
         offsets.append(np.column_stack([local[:, 0], np.where(inside[:, None], at - local[:, 1:], np.nan)]))
     left, right = offsets
     known = np.isfinite(left[:, 1]) & np.isfinite(right[:, 1])
-    aside = Profile(left[known, 0], (left[known, 1] + right[known, 1]) / 2.0)
+    aside = Samples((left[known, 1] + right[known, 1]) / 2.0, left[known, 0])
     height = np.concatenate([left[known], right[known]])
-    return aside, Profile(height[:, 0], height[:, 2])
+    return aside, Samples(height[:, 2], height[:, 0])
 
 
-def true_bed_error(case: Case) -> Profile:
+def true_bed_error(case: Case) -> Samples:
     """Return the height of the candidate's bed and sleepers less the true one between the rails, every 5 cm, m."""
     real = truth_railway(case)
     if not real.rail.shape[1]:
@@ -104,10 +95,10 @@ def true_bed_error(case: Case) -> Profile:
     down = -np.tile(curve.frames(station)[3], (len(_LANES), 1))
     depth = [caster.first(origin, down)[0] for caster in (truth_caster(case), surface_caster(case))]
     gap = np.clip(np.where(np.isfinite(depth[1]), depth[0] - depth[1], -1.0), -0.3, 0.3)
-    return Profile(np.tile(station, len(_LANES)), np.where(np.isfinite(depth[0]), gap, 0.0))
+    return Samples(np.where(np.isfinite(depth[0]), gap, 0.0), np.tile(station, len(_LANES)))
 
 
-def true_pocket_error(case: Case) -> Profile:
+def true_pocket_error(case: Case) -> Samples:
     """Return by how much each open pocket of the truth is deeper or flatter in the candidate, m."""
     truth = case.truth
     assert truth is not None
@@ -117,7 +108,7 @@ def true_pocket_error(case: Case) -> Profile:
     station, angle, length = (np.array([one[key] for one in pockets]) for key in ("station", "angle", "length"))
     depths = [_depth_at(relief, station, angle, length) for relief in (truth_relief(case), relief_on_truth(case))]
     known = np.isfinite(depths[0]) & np.isfinite(depths[1])
-    return Profile(station[known], (depths[1] - depths[0])[known])
+    return Samples((depths[1] - depths[0])[known], station[known])
 
 
 def _depth_at(
@@ -157,15 +148,15 @@ def _beams_on(case: Case, part: str) -> Bool[np.ndarray, " n"]:
     return np.asarray((parts_hit(case) == part) & (hold_frame(case).cell >= 0) & np.isfinite(beam_offsets(case)))
 
 
-def seen_rail_height(case: Case) -> Profile:
+def seen_rail_height(case: Case) -> Samples:
     """Return how far the candidate's rails lie above the returns on them, beam by beam, m."""
     if not has_rails(case):
         return NOTHING
     level = _beams_on(case, "rail") & (np.abs(_normals(case)[:, 2]) > _UPRIGHT)
-    return Profile(hold_frame(case).local[level, 0], -beam_offsets(case)[level])
+    return Samples(-beam_offsets(case)[level], hold_frame(case).local[level, 0])
 
 
-def seen_rail_side(case: Case) -> Profile:
+def seen_rail_side(case: Case) -> Samples:
     """Return how far the candidate's rails lie outside the returns on their inner faces, beam by beam, m.
 
     A sensor that is carried over one rail does not see the inner face of that one.
@@ -177,10 +168,10 @@ def seen_rail_side(case: Case) -> Profile:
     side = np.sign(hold_frame(case).local[:, 1] + hold_frame(case).middle[0] - middle)
     steep = _beams_on(case, "rail") & (np.abs(_normals(case)[:, 2]) < 1.0 - _UPRIGHT)
     inner = steep & (returns(case).heading[:, 1] * side > 0.0)
-    return Profile(hold_frame(case).local[inner, 0], beam_offsets(case)[inner])
+    return Samples(beam_offsets(case)[inner], hold_frame(case).local[inner, 0])
 
 
-def seen_bed_error(case: Case) -> Profile:
+def seen_bed_error(case: Case) -> Samples:
     """Return the height of the candidate's bed and sleepers over the returns between the rails, medians of 5 cm, m."""
     if not has_rails(case):
         return NOTHING
@@ -194,4 +185,4 @@ def seen_bed_error(case: Case) -> Profile:
     bins = ((station[near] - frame.low) / BED_BIN).astype(int)
     medians = -grouped_median(bins, offset[near], count, _LEAST)
     known = np.isfinite(medians)
-    return Profile(frame.low + (np.flatnonzero(known) + 0.5) * BED_BIN, medians[known])
+    return Samples(medians[known], frame.low + (np.flatnonzero(known) + 0.5) * BED_BIN)

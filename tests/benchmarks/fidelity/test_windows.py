@@ -4,6 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from benchmarks.fidelity.windows.measures import SENSORS, limits, sensor_of
+from benchmarks.fidelity.windows.shift import REACH, shift_by_window
 
 from benchmarks.fidelity import judge
 from benchmarks.fidelity.case import Case
@@ -12,8 +14,6 @@ from benchmarks.fidelity.faults.kinds import local_site, stated_faults
 from benchmarks.fidelity.registry import Value
 from benchmarks.fidelity.windows.deviation import COLUMNS, FINE, LEAST, TRACK, Relief, hold_frame, hold_map, parts_hit
 from benchmarks.fidelity.windows.judge import Noticed, Windows, Worst, dump_windows, load_windows, worst_windows
-from benchmarks.fidelity.windows.measures import SENSORS, limits, sensor_of
-from benchmarks.fidelity.windows.shift import REACH, shift_by_window
 from tests.benchmarks.fidelity import tube
 
 LENGTH = 24.0
