@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.fidelity.case import Case
-from benchmarks.fidelity.faults import ladder
+from benchmarks.fidelity.faults import runner as ladder
 from benchmarks.fidelity.files import FidelityError
 from tests.benchmarks.fidelity import tube
 
@@ -33,17 +33,6 @@ def test_a_ladder_finds_the_limit_and_goes_on_where_it_was(good, tmp_path, monke
     table = ladder.write_ladder(tmp_path, rows)
     assert [one["noticed_at_asked"] for one in table] == [1, 1]
     assert (tmp_path / "ladder.csv").read_text().count("\n") == 3
-
-
-def test_the_smallest_rung_is_found_whatever_is_guessed() -> None:
-    for smallest in range(17):
-        for guess in range(-1, 16):
-            low, high, rung, tries = -1, 16, 12, 0
-            while high - low > 1:
-                low, high, tries = (low, rung, tries + 1) if rung >= smallest else (rung, high, tries + 1)
-                rung = ladder.next_rung(low, high, guess)
-            assert high == min(smallest, 16)
-            assert tries <= (3 if smallest == guess and smallest > 0 else 7)
 
 
 def test_the_sizes_that_half_and_95_percent_of_places_notice_are_known() -> None:

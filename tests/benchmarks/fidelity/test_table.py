@@ -9,7 +9,6 @@ from benchmarks.fidelity import table
 from benchmarks.fidelity.derive.sections import truth_caster
 from benchmarks.fidelity.derive.surface import surface_nearest
 from benchmarks.fidelity.registry import dump_values, estimate, load_values, mean
-from benchmarks.fidelity.report import _worst_stretch
 from benchmarks.fidelity.table import B, D, Map, P, U
 from tests.benchmarks.fidelity import tube
 
@@ -58,18 +57,13 @@ def test_a_map_scores_as_the_specification_says(map: Map, value: float, score: f
     assert map.score(value) == pytest.approx(score)
 
 
-def test_the_worst_stretch_of_a_metric_along_the_tunnel_is_kept_with_its_place() -> None:
+def test_an_interval_is_that_of_whole_blocks_of_the_tunnel() -> None:
     station = np.arange(0.0, 50.0, 0.5)
     error = np.where((station >= 20.0) & (station < 30.0), 0.3, 0.1)
     found = estimate(mean, error, station, np.random.default_rng(0))
-    assert found.extremes == ((0.0, pytest.approx(0.1)), (20.0, pytest.approx(0.3)))
     assert found.interval == (pytest.approx(0.1), pytest.approx(0.22, abs=0.025))  # one block in five is worse
     assert load_values(dump_values({"one": found})) == {"one": found}
-    row = table.load()["c2m_mean"]
-    worst = _worst_stretch(row, found)
-    assert worst == {"start": 20.0, "end": 30.0, "value": pytest.approx(0.3), "score": 0.0}
-    assert _worst_stretch(table.load()["cl_icp_translation"], found)["value"] == pytest.approx(0.3)
-    assert estimate(mean, error[:3], station[:3], np.random.default_rng(0)).extremes is None
+    assert estimate(mean, error[:3], station[:3], np.random.default_rng(0)).interval is None
 
 
 POINTS = np.array([[1.0, 0.2, 0.1], [4.0, -0.3, 0.4]])

@@ -14,7 +14,7 @@ from benchmarks.fidelity.inputs import Inputs
 from benchmarks.fidelity.judge import Judgement
 from benchmarks.fidelity.registry import Value, missing
 from benchmarks.fidelity.report import figures, write_report
-from benchmarks.fidelity.report.figures import Sheet, draw_categories
+from benchmarks.fidelity.report.figures import Sheet
 from tests.benchmarks.fidelity import tube
 
 Values = dict[str, Value]
@@ -132,7 +132,7 @@ def test_all_forms_are_written_and_agree(tmp_path: Path) -> None:
     assert page.index(content["verdict"]) < page.index("Categories")
     assert 'src="http' not in page
     assert "N24" in (tmp_path / "controls.csv").read_text()
-    assert {p.name for p in (tmp_path / "figures").iterdir()} == {"categories.png", "categories.svg"}
+    assert not list((tmp_path / "figures").iterdir())  # nothing to draw without a reference
 
 
 def test_a_figure_that_cannot_be_drawn_costs_no_other(
@@ -141,12 +141,14 @@ def test_a_figure_that_cannot_be_drawn_costs_no_other(
     def broken(sheet: Sheet) -> None:
         raise ValueError("too little of the section")
 
-    monkeypatch.setattr(figures, "FIGURES", (("F00-broken", broken, None), ("F13", draw_categories, None)))
+    fine = lambda sheet: (figures.plt.figure(), "a caption")  # noqa: E731
+    monkeypatch.setattr(figures, "FIGURES", (("F00-broken", broken, None), ("F13", fine, None)))
     case = replace(tube.case(), hold=None, truth=None, cache={})
     judgement = judge.make_judgement({"base": values(0.98), "null": values(0.7)}, [])
     write_report(tmp_path, case, Inputs(), judgement, None)
     assert "F00-broken is left out: too little of the section" in capsys.readouterr().out
-    assert {path.name for path in (tmp_path / "figures").iterdir()} == {"F13.png", "F13.svg"}
+    assert {path.name for path in (tmp_path / "figures").iterdir()} == {"F13.png"}
+    assert "a caption" in (tmp_path / "report.html").read_text()
 
 
 def test_a_run_that_was_cut_short_goes_on_with_the_next_candidate(

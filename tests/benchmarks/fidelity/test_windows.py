@@ -4,16 +4,35 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from benchmarks.fidelity.windows.measures import SENSORS, limits, sensor_of
-from benchmarks.fidelity.windows.shift import REACH, shift_by_window
 
 from benchmarks.fidelity import judge
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.faults import Fault, put_in
 from benchmarks.fidelity.faults.kinds import local_site, stated_faults
 from benchmarks.fidelity.registry import Value
-from benchmarks.fidelity.windows.deviation import COLUMNS, FINE, LEAST, TRACK, Relief, hold_frame, hold_map, parts_hit
-from benchmarks.fidelity.windows.judge import Noticed, Windows, Worst, dump_windows, load_windows, worst_windows
+from benchmarks.fidelity.windows.deviation import (
+    COLUMNS,
+    FINE,
+    LEAST,
+    REACH,
+    TRACK,
+    Relief,
+    hold_frame,
+    hold_map,
+    parts_hit,
+    shift_by_window,
+)  # fmt: skip
+from benchmarks.fidelity.windows.judge import (
+    SENSORS,
+    Noticed,
+    Windows,
+    Worst,
+    dump_windows,
+    limits,
+    load_windows,
+    sensor_of,
+    worst_windows,
+)  # fmt: skip
 from tests.benchmarks.fidelity import tube
 
 LENGTH = 24.0
