@@ -85,48 +85,35 @@ def kept_until(category: str, keep: Callable[[Function], Function]) -> Callable[
     return mark
 
 
-def per_case(function: Function) -> Function:
-    """Keeps the result of a function, for each of its arguments after the case, once per case."""
-    return _kept_in(function, lambda case, *_: (case.cache, ()))
-
-
-def per_hold(function: Function) -> Function:
-    """Keeps the result of a function of recording and seed once for all candidates."""
-    return _kept_in(function, lambda case, *_: _reference_cache(case, case.hold))
-
-
-def per_truth(function: Function) -> Function:
-    """Keeps the result of a function of truth and seed once for all candidates."""
-    return _kept_in(function, lambda case, *_: _reference_cache(case, case.truth))
-
-
-def per_reference(function: Function) -> Function:
-    """Keeps the result of a function of the truth, or of the recording where there is none, for all candidates."""
-    return _kept_in(function, lambda case, *_: _reference_cache(case, case.truth or case.hold))
-
-
-def per_side(function: Function) -> Function:
-    """Keeps the result of a function of a case and `real`: for all candidates where `real`, else once per case."""
-    return _kept_in(function, lambda case, real: _reference_cache(case, case.hold) if real else (case.cache, ()))
-
-
-def _kept_in(function: Function, place: Callable[..., tuple[dict[Any, Any], tuple[Any, ...]]]) -> Function:
-    """Keeps the results of a function in the dictionary that `place` gives, by its arguments and the given settings."""
-
-    @wraps(function)
-    def once(case: Case, *args: Any) -> Any:
-        results, settings = place(case, *args)
-        key = (function.__module__, function.__qualname__, *settings, *args)
-        if key not in results:
-            results[key] = function(case, *args)
-        return results[key]
-
-    return cast(Function, once)
-
-
 def _reference_cache(case: Case, reference: Hold | Truth | None) -> tuple[dict[Any, Any], tuple[Any, ...]]:
     assert reference is not None
     return reference.cache, (case.seed,)
+
+
+def _keeper(place: Callable[..., tuple[dict[Any, Any], tuple[Any, ...]]]) -> Callable[[Function], Function]:
+    """Keeps the results of a function in the dictionary that `place` gives, by its arguments and the given settings."""
+
+    def keep(function: Function) -> Function:
+        @wraps(function)
+        def once(case: Case, *args: Any) -> Any:
+            results, settings = place(case, *args)
+            key = (function.__module__, function.__qualname__, *settings, *args)
+            if key not in results:
+                results[key] = function(case, *args)
+            return results[key]
+
+        return cast(Function, once)
+
+    return keep
+
+
+# Each keeps the results of a function of a case: once a case, or for all candidates those of recording and seed, of
+# truth and seed, of the truth or else the recording, and where the second argument `real` is true.
+per_case = _keeper(lambda case, *_: (case.cache, ()))
+per_hold = _keeper(lambda case, *_: _reference_cache(case, case.hold))
+per_truth = _keeper(lambda case, *_: _reference_cache(case, case.truth))
+per_reference = _keeper(lambda case, *_: _reference_cache(case, case.truth or case.hold))
+per_side = _keeper(lambda case, real: _reference_cache(case, case.hold) if real else (case.cache, ()))
 
 
 @run_once

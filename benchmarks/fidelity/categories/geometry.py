@@ -175,13 +175,17 @@ def sec_variation_corr(case: Case) -> Value:
     judged, reference = variation(case)
     if judged.std() < _NO_VARIATION:
         return number(0.0, judged.size, "the lining's section does not vary")
+    return _correlate(judged, reference, sections(case).station, case.rng("sec_variation_corr"))
+
+
+def _correlate(judged: np.ndarray, reference: np.ndarray, station: np.ndarray, rng: np.random.Generator) -> Value:
+    """Return the correlation of two rows of numbers along the tunnel, with its interval."""
 
     def correlation(index: np.ndarray) -> float:
-        row = index.astype(int)
-        return float(np.corrcoef(judged[row].ravel(), reference[row].ravel())[0, 1])
+        rows = index.astype(int)
+        return float(np.corrcoef(judged[rows].ravel(), reference[rows].ravel())[0, 1])
 
-    index = np.arange(len(judged), dtype=float)
-    return estimate(correlation, index, sections(case).station, case.rng("sec_variation_corr"))
+    return estimate(correlation, np.arange(len(judged), dtype=float), station, rng)
 
 
 @metric("sec_variation_ratio", "SEC", B(1, 1e-06, 1), needs="reference")
@@ -206,12 +210,7 @@ def lin_depth_map_ncc(case: Case) -> Value:
     station, judged, hold = lining.paired_depths(case)
     if judged.std() < 1e-4:
         return number(0.0, len(judged), "the lining is smooth")
-
-    def correlation(index: np.ndarray) -> float:
-        rows = index.astype(int)
-        return float(np.corrcoef(judged[rows], hold[rows])[0, 1])
-
-    return estimate(correlation, np.arange(len(judged), dtype=float), station, case.rng("lin_depth_map_ncc"))
+    return _correlate(judged, hold, station, case.rng("lin_depth_map_ncc"))
 
 
 @metric("lin_pocket_f1", "LIN", U(0.3, 0.99715), gate=True, needs="reference")
@@ -268,9 +267,8 @@ def lin_axial_pitch_err(case: Case) -> Value:
 @metric("lin_circ_pitch_err", "LIN", D(1e-06, 15), "%", needs="reference")
 def lin_circ_pitch_err(case: Case) -> Value:
     """Relative error of the median distance between rows of pockets around the section, %."""
-    judged, reference = (
-        np.diff(lining.pocket_rows(side, lining.reference_arc(case))) for side in lining.both_maps(case)
-    )
+    arc = lining.reference_arc(case)
+    judged, reference = (np.diff(lining.pocket_rows(side, arc)) for side in lining.both_maps(case))
     if not len(reference):
         return missing(_NO_POCKETS)
     if not len(judged):
@@ -287,9 +285,8 @@ def lin_ring_phase_err(case: Case) -> Value | Samples:
     judged, reference = (lining.ring_phases(side, length) for side in lining.both_maps(case))
     count = min(len(judged), len(reference))
     gap = np.abs((judged[:count] - reference[:count] + np.pi) % (2 * np.pi) - np.pi) / (2 * np.pi)
-    share = np.where(np.isnan(judged[:count]), _UNKNOWN_PHASE, gap)
     centre = length * lining.PHASE_PITCHES / 2 * (1 + np.arange(count))
-    return Samples(share, centre)
+    return Samples(np.where(np.isnan(judged[:count]), _UNKNOWN_PHASE, gap), centre)
 
 
 @metric("lin_nail_count_ratio", "LIN")

@@ -231,17 +231,17 @@ def mj_wall_contact_err(case: Case) -> Value:
 @metric("mj_ray_vs_mesh_mae", "SCN", D(0.001, 0.02), "m")
 def mj_ray_vs_mesh_mae(case: Case) -> Value:
     """Mean difference of ranges, compiled scene against the meshes, m."""
-    pairs = rays_from_axis(case)
-    both = np.isfinite(pairs.scene) & np.isfinite(pairs.mesh) & pairs.comparable
-    return number(np.mean(np.abs(pairs.scene[both] - pairs.mesh[both])), int(both.sum()))
+    scene, mesh, comparable = rays_from_axis(case)
+    both = np.isfinite(scene) & np.isfinite(mesh) & comparable
+    return number(np.mean(np.abs(scene[both] - mesh[both])), int(both.sum()))
 
 
 @metric("mj_ray_leak_rate", "SCN", D(1e-05, 0.001))
 def mj_ray_leak_rate(case: Case) -> Value:
     """Share of rays that meet the meshes and nothing in the scene."""
-    pairs = rays_from_axis(case)
-    due = np.isfinite(pairs.mesh)
-    return number(np.mean(~np.isfinite(pairs.scene[due])), int(due.sum()))
+    scene, mesh, _ = rays_from_axis(case)
+    due = np.isfinite(mesh)
+    return number(np.mean(~np.isfinite(scene[due])), int(due.sum()))
 
 
 @metric("mj_manifest_match", "SCN", P, "bool")

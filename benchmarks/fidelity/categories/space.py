@@ -157,7 +157,7 @@ def free3d_false_occupied(case: Case) -> Samples:
 
     Occupied is whatever lies 5 cm outside its lining, and what its extra surfaces fill or close off.
     """
-    passed, both = freespace.carve_beams(case).passed, freespace.air_voxels(case)
+    passed, both = freespace.carve_beams(case)[0], freespace.air_voxels(case)
     local = freespace.carved_about(case, reference_curve(case))[0]
     outside = lining_radii(case).depth(passed) < -_RADII_SLACK
     if len(case.candidate.extra.faces):

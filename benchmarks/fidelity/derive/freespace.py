@@ -24,18 +24,13 @@ _CARVE_FARTHEST = 25.0  # m
 CARVE_MARGIN = 0.20  # m before the return where a beam's air ends
 
 
-@dataclass(frozen=True)
-class Carved:
-    """Samples along held-out beams."""
-
-    passed: Float[np.ndarray, "k 3"]  # Points that beams went through, tunnel frame, m
-    beam: Int[np.ndarray, " k"]  # Number of the beam of each point
-    ended: Float[np.ndarray, "b 3"]  # Returns of the same beams, m
-
-
 @kept_until("F3D", per_hold)
-def carve_beams(case: Case) -> Carved:
-    """Samples about 300 beams a metre every 15 cm, from the sensor to 20 cm before the return or 25 m."""
+def carve_beams(case: Case) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "b 3"]]:
+    """Samples about 300 beams a metre every 15 cm, from the sensor to 20 cm before the return or 25 m.
+
+    Returns:
+        Points that beams went through, and the returns of the same beams, tunnel frame, m.
+    """
     real = returns(case)
     length = np.linalg.norm(np.ptp(real.origin, axis=0)) + 10.0
     back = np.arange(0, len(real.range), max(1, int(len(real.range) / (_BEAMS_PER_METRE * length))))
@@ -45,14 +40,13 @@ def carve_beams(case: Case) -> Carved:
     beam = np.repeat(np.arange(len(back)), count)
     place = np.arange(len(beam)) - np.repeat(np.cumsum(count) - count, count)
     along = (place + 0.5) * _CARVE_STEP
-    passed = origin[beam] + along[:, None] * direction[beam]
-    return Carved(passed, beam, real.points[back])
+    return origin[beam] + along[:, None] * direction[beam], real.points[back]
 
 
 @kept_until("F3D", per_hold)
 def carved_about(case: Case, curve: Curve) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "b 3"]]:
-    samples = carve_beams(case)
-    return curve.local(samples.passed), curve.local(samples.ended)
+    passed, ended = carve_beams(case)
+    return curve.local(passed), curve.local(ended)
 
 
 # Air in voxels of (station, left, up), 20 cm, so that nothing is aligned with the world.

@@ -1,6 +1,5 @@
 """The released scene: files, rays, inventory, rail seats."""
 
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from xml.etree import ElementTree
@@ -98,32 +97,23 @@ _EYES = 100
 _RAYS_PER_EYE = 1000
 
 
-@dataclass(frozen=True)
-class RayPairs:
-    """Ranges of the same rays in scene and mesh."""
-
-    scene: Float[np.ndarray, " k"]  # Ranges by MuJoCo, m; `inf` for none
-    mesh: Float[np.ndarray, " k"]  # Ranges by embree in lining and track, m; `inf` for none
-    comparable: Bool[np.ndarray, " k"]  # True where MuJoCo hit a part of those meshes
-
-
 @per_case
-def rays_from_axis(case: Case) -> RayPairs:
+def rays_from_axis(case: Case) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"], Bool[np.ndarray, " k"]]:
+    """Casts rays from the axis.
+
+    Returns:
+        Ranges by MuJoCo, and by embree in lining and track, m, `inf` for none; True where MuJoCo hit a part of those.
+    """
     _, eye, _ = random_stations(case, "mj_ray_vs_mesh_mae", _EYES)
     way = case.rng("mj_ray_leak_rate").normal(size=(_EYES, _RAYS_PER_EYE, 3))
     way /= np.linalg.norm(way, axis=2, keepdims=True)
-    return ray_pairs(case, eye, way)
-
-
-def ray_pairs(case: Case, eye: Float[np.ndarray, "e 3"], way: Float[np.ndarray, "e r 3"]) -> RayPairs:
     model = scene_model(case)
     reach, geom = scene_ranges(model, eye, way)
-    flat = way.reshape(-1, 3)
-    mesh = surface_caster(case).first(np.repeat(eye, way.shape[1], axis=0), flat)[0]
+    mesh = surface_caster(case).first(np.repeat(eye, _RAYS_PER_EYE, axis=0), way.reshape(-1, 3))[0]
     # Nails and lamps are of the scene alone.
     ours = np.ones(model.ngeom + 1, bool)  # the last is for a ray that meets nothing
     ours[:-1] = np.isin(np.arange(model.ngeom), scene_geoms(case).named(*_MESH_NAMES))
-    return RayPairs(reach, mesh, ours[geom])
+    return reach, mesh, ours[geom]
 
 
 def scene_ranges(
@@ -151,41 +141,34 @@ _SEAT_REACH = 0.20  # m between parts of the fastening of one seat
 def count_assets(case: Case) -> dict[str, int]:
     """Counts assets by the names of the manifest; a fastener is a clip with its shoulder, two to a seat."""
     names = scene_geoms(case).names
-    pieces = fastening_pieces(scene_track(case).fastening_mesh)
-    pad = pieces.height <= _PAD_HEIGHT
+    middle, height = fastening_pieces(scene_track(case).fastening_mesh)
+    pad = height <= _PAD_HEIGHT
     return {
         "sleepers": sum(name.startswith("sleeper_") for name in names),
         "rails": len({name.split("_")[1] for name in names if name.startswith("rail_")}),
-        "fasteners": len(cluster_points(pieces.middle[~pad], _FASTENER_REACH)),
+        "fasteners": len(cluster_points(middle[~pad], _FASTENER_REACH)),
         "pads": int(pad.sum()),
         "lining_chunks": sum(name.startswith("lining") for name in names),
         "wall_panels": sum(name.startswith("wall_") for name in names),
     }
 
 
-@dataclass(frozen=True)
-class Pieces:
-    """Connected pieces of a mesh."""
-
-    middle: Float[np.ndarray, "k 3"]  # Middle of each piece, m
-    height: Float[np.ndarray, " k"]  # Vertical extent, m
-
-
-def fastening_pieces(mesh: trimesh.Trimesh) -> Pieces:
+def fastening_pieces(mesh: trimesh.Trimesh) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, " k"]]:
+    """Return the middle and the vertical extent of each connected piece, m."""
     if not len(mesh.faces):
-        return Pieces(np.zeros((0, 3)), np.zeros(0))
+        return np.zeros((0, 3)), np.zeros(0)
     part = face_parts(mesh)
     order = np.argsort(part, kind="stable")
     corners = mesh.triangles[order].reshape(-1, 3)
     starts = 3 * np.searchsorted(part[order], np.arange(part.max() + 1))
     low, high = np.minimum.reduceat(corners, starts), np.maximum.reduceat(corners, starts)
-    return Pieces((low + high) / 2, (high - low)[:, 2])
+    return (low + high) / 2, (high - low)[:, 2]
 
 
 @per_case
 def fastening_sets(case: Case) -> Float[np.ndarray, "k 3"]:
     """Return the middle of each fastening, that is, of the pieces that lie together, m."""
-    return cluster_points(fastening_pieces(case.candidate.track.fastening_mesh).middle, _SEAT_REACH)
+    return cluster_points(fastening_pieces(case.candidate.track.fastening_mesh)[0], _SEAT_REACH)
 
 
 def cluster_points(middle: Float[np.ndarray, "p 3"], reach: float) -> Float[np.ndarray, "k 3"]:

@@ -4,8 +4,7 @@ A fault is one row: kind, size, place, extent. A kind is one function with `faul
 registers those of the suite, and a file of a user's own registers more (`--metrics`).
 """
 
-from benchmarks.fidelity.faults import mesh, references, shape, track
+from benchmarks.fidelity.faults import mesh, references, shape
 from benchmarks.fidelity.faults.kinds import KINDS, Fault, Kind, Site, fault_kind, put_in
 
-__all__ = ["KINDS", "Fault", "Kind", "Site", "fault_kind", "mesh", "put_in", "references", "shape",
-           "track"]  # fmt: skip
+__all__ = ["KINDS", "Fault", "Kind", "Site", "fault_kind", "mesh", "put_in", "references", "shape"]

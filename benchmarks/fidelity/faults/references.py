@@ -17,7 +17,7 @@ from benchmarks.fidelity.faults.kinds import Fault, PointMap, Site, fault_kind, 
 from benchmarks.fidelity.faults.mesh import change_both
 from benchmarks.fidelity.files import FidelityError
 from benchmarks.fidelity.impostors import null_tube
-from benchmarks.fidelity.references import Hold, Truth
+from benchmarks.fidelity.references import Hold
 
 
 @fault_kind("turned", "held-out beams turned about the sensor's vertical and side axis", "rad")
@@ -85,23 +85,18 @@ def _yaw_matrix(tangent: np.ndarray) -> np.ndarray:
 
 def move_references(case: Case, turn: Float[np.ndarray, "3 3"], shift: Float[np.ndarray, "3"]) -> Case:
     """Turns held-out recording, fit and truth about the origin and shifts them."""
-    hold, fit = (None if h is None else move_hold(h, turn, shift) for h in (case.hold, case.fit))
-    truth = None if case.truth is None else move_truth(case.truth, turn, shift)
+    hold, fit = (
+        None if h is None else replace(h, origin=h.origin @ turn.T + shift, direction=h.direction @ turn.T, cache={})
+        for h in (case.hold, case.fit)
+    )
+    truth = case.truth
+    if truth is not None:
+        surface = warp_mesh(truth.surface, lambda points: points @ turn.T + shift)
+        truth = replace(
+            truth, position=truth.position @ turn.T + shift, tangent=truth.tangent @ turn.T, surface=surface,
+            furniture=_turn_positions(truth.furniture, truth.origin, turn, shift), cache={},
+        )  # fmt: skip
     return replace(case, hold=hold, fit=fit, truth=truth, cache={})
-
-
-def move_hold(hold: Hold, turn: Float[np.ndarray, "3 3"], shift: Float[np.ndarray, "3"]) -> Hold:
-    """Turns a recording about the origin and shifts it; kept results are dropped."""
-    return replace(hold, origin=hold.origin @ turn.T + shift, direction=hold.direction @ turn.T, cache={})
-
-
-def move_truth(truth: Truth, turn: Float[np.ndarray, "3 3"], shift: Float[np.ndarray, "3"]) -> Truth:
-    """Turns a truth about the origin of the tunnel frame and shifts it; kept results are dropped."""
-    surface = warp_mesh(truth.surface, lambda points: points @ turn.T + shift)
-    return replace(
-        truth, position=truth.position @ turn.T + shift, tangent=truth.tangent @ turn.T, surface=surface,
-        furniture=_turn_positions(truth.furniture, truth.origin, turn, shift), cache={},
-    )  # fmt: skip
 
 
 def bend_recording(hold: Hold, move: PointMap) -> Hold:

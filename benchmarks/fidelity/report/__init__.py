@@ -29,28 +29,21 @@ def paper_rows(judgement: Judgement) -> list[dict[str, Any]]:
         value = judgement.values[name][id].value
         return None if value is None else 100.0 * value
 
-    counts, text = (
-        f"{len(scored.categories)} / {len(judgement.values['base'])}",
-        "none" if null is None else f"{null:.1f}",
-    )
-    return [
-        _paper_row("global score", 97.1, scored.overall, "%", "mixed", f"over {scored.evaluated} of "
-                   f"{len(scored.categories)} categories; the null tube has {text}"),
-        _paper_row("categories / metrics", "18 / 199", counts, "", "-", "same counts"),
-        _paper_row("cloud to mesh, mean, cloud cast in the same mesh", 2.46, ours("selfcast_p2s_mean"), "cm",
-                   "C", "by construction: range noise alone, alike for any mesh; logged, never scored"),
-        _paper_row("the same within 10 cm", 97.5, ours("selfcast_within_10cm"), "%", "C",
-                   "by construction, as above"),
-        _paper_row("cloud to mesh, mean, held-out points", 2.46, ours("c2m_mean"), "cm", "H",
-                   "the comparable claim, on points that the builder never read"),
-        _paper_row("the same within 10 cm", 97.5, ours("c2m_within_10cm"), "%", "H", "held-out points"),
-        _paper_row("the same, null tube", None, ours("c2m_mean", "null"), "cm", "H",
-                   "what a constant tube on the right axis gets"),
-    ]  # fmt: skip
-
-
-def _paper_row(what: str, paper: Any, here: Any, unit: str, evidence: str, note: str) -> dict[str, Any]:
-    return {"what": what, "paper": paper, "here": here, "unit": unit, "evidence": evidence, "note": note}
+    counts = f"{len(scored.categories)} / {len(judgement.values['base'])}"
+    over = f"over {scored.evaluated} of {len(scored.categories)} categories; the null tube has {number_text(null)}"
+    rows = (
+        ("global score", 97.1, scored.overall, "%", "mixed", over),
+        ("categories / metrics", "18 / 199", counts, "", "-", "same counts"),
+        ("cloud to mesh, mean, cloud cast in the same mesh", 2.46, ours("selfcast_p2s_mean"), "cm", "C",
+         "by construction: range noise alone, alike for any mesh; logged, never scored"),
+        ("the same within 10 cm", 97.5, ours("selfcast_within_10cm"), "%", "C", "by construction, as above"),
+        ("cloud to mesh, mean, held-out points", 2.46, ours("c2m_mean"), "cm", "H",
+         "the comparable claim, on points that the builder never read"),
+        ("the same within 10 cm", 97.5, ours("c2m_within_10cm"), "%", "H", "held-out points"),
+        ("the same, null tube", None, ours("c2m_mean", "null"), "cm", "H",
+         "what a constant tube on the right axis gets"),
+    )  # fmt: skip
+    return [dict(zip(("what", "paper", "here", "unit", "evidence", "note"), row, strict=True)) for row in rows]
 
 
 SCHEMA = "subterra.fidelity/1"
