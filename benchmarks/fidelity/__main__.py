@@ -16,7 +16,7 @@ from benchmarks.fidelity import judge, outside
 from benchmarks.fidelity.case import Case, case_hash
 from benchmarks.fidelity.faults import runner
 from benchmarks.fidelity.faults.runner import Bench, is_bold, judge_outcomes, list_jobs, run_jobs
-from benchmarks.fidelity.files import FidelityError, read_kept, write_json
+from benchmarks.fidelity.files import FidelityError, read_kept, write_csv, write_json
 from benchmarks.fidelity.inputs import (
     Inputs,
     SplitConfig,
@@ -88,8 +88,7 @@ def load_outside(inputs: Inputs) -> None:
 
 def open_case(inputs: Inputs, processes: int = 1) -> OpenCase:
     """Reads the inputs and judges the case without controls; values of an earlier command are read again."""
-    if processes < 1:
-        raise FidelityError(f"processes must be at least 1, got {processes}")
+    _check_processes(processes)
     require_folder(inputs.out)
     load_outside(inputs)
     resolved = complete_inputs(inputs)
@@ -126,14 +125,18 @@ def run_controls(config: ControlsConfig) -> None:
     _print_summary(_write_report(opened))
 
 
+def _check_processes(count: int) -> None:
+    if count < 1:
+        raise FidelityError(f"processes must be at least 1, got {count}")
+
+
 def _check_controls(config: ControlsConfig) -> None:
     """Refuses wrong controls before the scene is judged, which takes minutes."""
     load_outside(config)
     known = {job.control for job in list_jobs()}
     if unknown := [name for name in config.only if name not in known]:
         raise FidelityError(f"no control {unknown[0]!r}; there are {', '.join(sorted(known))}")
-    if config.processes < 1:
-        raise FidelityError(f"processes must be at least 1, got {config.processes}")
+    _check_processes(config.processes)
     if config.foreign is not None:
         require_input(config.foreign / "manifest.json")
 
@@ -167,7 +170,9 @@ def run_faults(config: FaultsConfig) -> None:
     print(
         f"{case.candidate.name}: smallest sizes noticed at 95 % of {config.places} places; {config.out / 'ladder.csv'}"
     )
-    for one in runner.write_ladder(config.out, rows):
+    table = runner.sum_up(rows)
+    write_csv(config.out / "ladder.csv", tuple(table[0]), table)
+    for one in table:
         factor, unit = (1000.0, "mm") if one["kind"] == "gauge" else (100.0, "cm")
         print(f"  {one['kind']} over {one['length']:g} m: {factor * one['size_95']:.2g} {unit}; "
               f"{factor * one['asked']:g} {unit} noticed at {one['noticed_at_asked']} of {one['places']}")  # fmt: skip
@@ -188,7 +193,7 @@ def _write_report(opened: OpenCase) -> dict[str, Any]:
     rows = read_kept(folder / "controls.json", CONTROLS_SCHEMA, key).get("rows")
     leaks = find_leaks(opened.case, opened.judgement.values["base"])
     judgement = judge.make_judgement(opened.judgement.values, leaks, rows, opened.judgement.windows)
-    judgement = judge.add_outside(judgement, opened.case, folder)
+    judgement = judge.add_outside(judgement, opened.case)
     return write_report(folder, opened.case, inputs, judgement, rows)
 
 

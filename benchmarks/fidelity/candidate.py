@@ -166,9 +166,8 @@ def load_candidate(folder: Path) -> Candidate:
     try:
         with np.load(folder / "bore.npz") as data:
             bore = Bore(**{name: data[name] for name in Bore.__dataclass_fields__})
-        lining, solid = (
-            trimesh.load_mesh(folder / "meshes" / f"{name}.ply", process=False) for name in ("lining", "solid")
-        )
+        files = (folder / "meshes" / f"{name}.ply" for name in ("lining", "solid"))
+        lining, solid = (trimesh.load_mesh(file, process=False) for file in files)
         for mesh in (lining, solid):
             mesh.metadata.clear()  # the file's own arrays, as large as the mesh
         geoms = Geoms.of(load_model(scene))

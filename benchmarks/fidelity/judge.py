@@ -73,22 +73,13 @@ def compute_windows(case: Case, folder: Path) -> Windows:
     return found
 
 
-def compute_values(case: Case, folder: Path, processes: int = 1) -> dict[str, Values]:
-    """Return the raw values of the reconstruction, its null tube and the truth.
-
-    Each is kept in `values.json` when it is done, so that a run that was cut short goes on with the next.
-    """
-    with open_values(case, folder, processes) as values:
-        pass
-    return values
-
-
 @contextmanager
 def open_values(case: Case, folder: Path, processes: int = 1) -> Iterator[dict[str, Values]]:
     """Yields the values of the reconstruction; those of tube and truth are there by the end of the block.
 
-    With 2 or more processes, a second one computes half of the categories of every candidate. So what is derived from a
-    reference serves all candidates, and is mostly derived in one of the processes alone.
+    Each is kept in `values.json` when it is done, so that a run that was cut short goes on with the next. With 2 or
+    more processes, a second one computes half of the categories of every candidate. So what is derived from a reference
+    serves all candidates, and is mostly derived in one of the processes alone.
     """
     path, key = folder / "values.json", case_hash(case)
     values = {name: load_values(kept) for name, kept in read_kept(path, VALUES_SCHEMA, key).get("values", {}).items()}
@@ -200,9 +191,9 @@ def make_judgement(
     return Judgement(values, scored, skill, leaks, found.reasons() + reasons, windows=found)
 
 
-def add_outside(judgement: Judgement, case: Case, folder: Path) -> Judgement:
+def add_outside(judgement: Judgement, case: Case) -> Judgement:
     """Return the judgement with the metrics from outside computed and scored; its verdict stays the suite's."""
-    more = outside.compute_values(case, make_candidates(case), folder)
+    more = outside.compute_values(case, make_candidates(case))
     scored = {
         name: scoring.score_all(judgement.values[name] | values, table.load_all()) for name, values in more.items()
     }

@@ -6,18 +6,16 @@ Metrics are computed, scored and listed beside the 199 of the suite. The verdict
 import runpy
 from collections.abc import Callable
 from dataclasses import replace
-from hashlib import sha256
 from pathlib import Path
 
 from benchmarks.fidelity import faults, table
 from benchmarks.fidelity.candidate import Candidate
-from benchmarks.fidelity.case import Case, case_hash
-from benchmarks.fidelity.files import FidelityError, read_kept, write_json
-from benchmarks.fidelity.registry import Value, compute_metric, dump_values, load_values
+from benchmarks.fidelity.case import Case
+from benchmarks.fidelity.files import FidelityError
+from benchmarks.fidelity.registry import Value, compute_metric
 from benchmarks.fidelity.table import Metric
 from subterra_jax.host.loading import file_digest
 
-SCHEMA = "subterra.fidelity-outside/1"
 _LOADED: set[str] = set()  # metrics and kinds of fault of the file
 _FILES: dict[str, str] = {}  # its SHA-256 by its name
 
@@ -61,20 +59,10 @@ def files() -> dict[str, str]:
     return dict(_FILES)
 
 
-def compute_values(
-    case: Case, candidates: dict[str, Callable[[], Candidate]], folder: Path
-) -> dict[str, dict[str, Value]]:
-    """Return the values of all metrics from outside, by candidate and id; they are kept in `outside.json`."""
-    rows = metrics()
-    if not rows:
-        return {}
-    path, key = folder / "outside.json", sha256(f"{case_hash(case)} {sorted(_FILES.items())}".encode()).hexdigest()
-    if _FILES and (content := read_kept(path, SCHEMA, key)):
-        return {name: load_values(values) for name, values in content["values"].items()}
-    values: dict[str, dict[str, Value]] = {}
-    for name, make in candidates.items():
+def compute_values(case: Case, candidates: dict[str, Callable[[], Candidate]]) -> dict[str, dict[str, Value]]:
+    """Return the values of all metrics from outside, by candidate and id; none without such metrics."""
+    rows, values = metrics(), dict[str, dict[str, Value]]()
+    for name, make in (candidates if rows else {}).items():
         one = case if name == "base" else replace(case, candidate=make(), cache={})
         values[name] = {id: compute_metric(one, row) for id, row in rows.items()}
-    dumped = {name: dump_values(entry) for name, entry in values.items()}
-    write_json(path, {"schema": SCHEMA, "key": key, "values": dumped}, digits=17)
     return values

@@ -230,14 +230,11 @@ def load_truth(folder: Path, origin: Float[np.ndarray, "3"]) -> Truth:
     if data.get("schema") != TRUTH_SCHEMA:
         raise FidelityError(f"{path}: schema is {data.get('schema')}, not {TRUTH_SCHEMA}")
     surface, part = _read_parts(folder / "truth.ply", origin)
-    names = tuple(data.get("definitions", {}).get("parts", ())) or PARTS
+    names = tuple(data["definitions"]["parts"])
     columns = (np.asarray(data[name], float) for name in ("station", "position", "tangent", "width", "height"))
     station, position, tangent, width, height = columns
     furniture = {name: data[name] for name in ("rings", "pockets", "nails", "sleepers", "rails") if name in data}
     return Truth(station, position - origin, tangent, width, height, surface, part, names, furniture, origin)
-
-
-PARTS = ("lining", "joint", "pocket", "nail", "floor", "sleeper", "rail", "fastening")
 
 
 def _read_parts(path: Path, origin: Float[np.ndarray, "3"]) -> tuple[trimesh.Trimesh, Int[np.ndarray, " f"]]:

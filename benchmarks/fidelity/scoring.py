@@ -109,13 +109,8 @@ def reasons_against(
 ) -> list[str]:
     """Return the reasons for FAIL, in sentences; empty for PASS.
 
-    Args:
-        scored: Scores of the candidate.
-        null: Scores of the null tube on the same references; it is not read where there are none.
-        median_skill: Median skill over the metrics with H or T evidence.
-        undetected: Negative controls that were not detected; empty also where controls were not run.
-        loud: Invariance controls that moved.
-        leaks: Findings of the leak detector.
+    `null` are the scores of the null tube on the same references, `undetected` and `loud` the controls that were not
+    noticed or moved; both are empty where controls were not run.
     """
     reasons = []
     if scored.overall is None or scored.overall < PASS_GLOBAL:

@@ -68,7 +68,7 @@ def cl_length_rel_err(case: Case) -> Value:
 def cl_end_station_err(case: Case) -> Value:
     """Larger axial error of the two mouths, m."""
     curve = truth_curve(case)
-    low, high = axis.lining_mouths(case)
+    low, high = axis.surface_extent(curve.local(np.asarray(case.candidate.lining.vertices)))
     return number(max(abs(low - curve.station[0]), abs(high - curve.station[-1])), 2)
 
 

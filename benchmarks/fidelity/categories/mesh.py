@@ -43,9 +43,8 @@ def mesh_watertight(case: Case) -> Value:
 @metric("mesh_winding_consistent", "MSH", P, "bool", gate=True)
 def mesh_winding_consistent(case: Case) -> Value:
     """Neighbouring faces run along their edge in opposite senses, in lining and solid."""
-    return pass_or_fail(
-        derived.welded_lining(case).is_winding_consistent and derived.welded_solid(case).is_winding_consistent
-    )
+    both = derived.welded_lining(case), derived.welded_solid(case)
+    return pass_or_fail(all(mesh.is_winding_consistent for mesh in both))
 
 
 @metric("mesh_orientation_frac", "MSH", U(0.98, 0.999), gate=True)
@@ -102,7 +101,7 @@ def mesh_boundary_unexpected(case: Case) -> Value:
 @metric("mesh_nonmanifold_edges", "MSH", D(0, 0.001))
 def mesh_nonmanifold_edges(case: Case) -> Value:
     """Share of edges with more than two faces; the worse of lining and solid."""
-    both = derived.lining_edges(case), derived.solid_edges(case)
+    both = derived.lining_edges(case), derived.mesh_edges(derived.welded_solid(case))
     return number(max(float(np.mean(edges.faces > 2)) for edges in both), sum(len(edges.faces) for edges in both))
 
 

@@ -88,13 +88,6 @@ def lining_caster(case: Case) -> Caster:
     return Caster(case.candidate.lining)
 
 
-@per_case
-def lining_mouths(case: Case) -> tuple[float, float]:
-    """Return the first and last station of the lining along the reference axis, m; medians over 16 sectors."""
-    local = reference_curve(case).local(np.asarray(case.candidate.lining.vertices))
-    return surface_extent(local)
-
-
 def surface_extent(local: Float[np.ndarray, "k 3"]) -> tuple[float, float]:
     """Return the first and last station of a surface, m, each the median over 16 sectors."""
     sector = np.minimum(((np.arctan2(local[:, 2], local[:, 1]) + np.pi) / (np.pi / 8)).astype(int), 15)

@@ -24,12 +24,7 @@ _EVERYTHING = 2**31 - 1  # touches whatever collides with anything
 
 
 class Probe:
-    """The compiled scene with a free sphere in it.
-
-    Args:
-        case: Case with the scene.
-        bits: Collision bits of the sphere, MuJoCo's `contype` and `conaffinity`.
-    """
+    """The compiled scene with a free sphere in it, which collides by `bits`, MuJoCo's `contype` and `conaffinity`."""
 
     def __init__(self, case: Case, bits: int = _EVERYTHING) -> None:
         spec = mujoco.MjSpec.from_file(str(case.candidate.scene))

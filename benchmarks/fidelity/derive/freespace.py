@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import shapely
 from jaxtyping import Bool, Float, Int
-from scipy.ndimage import binary_dilation, distance_transform_edt, label
+from scipy.ndimage import binary_dilation, label
 from scipy.spatial import cKDTree
 
 from benchmarks.fidelity.case import Case, kept_until, per_case, per_hold, per_reference
@@ -192,20 +192,6 @@ def reachable(free: Bool[np.ndarray, "n m k"]) -> Bool[np.ndarray, "n m k"]:
     cells = np.bincount(np.concatenate([end.ravel() for end in ends]), minlength=count + 1)
     cells[0] = 0
     return np.isin(part, np.flatnonzero(cells > 0.1 * cells.max()))
-
-
-@per_case
-def clearance(case: Case) -> tuple[Float[np.ndarray, "n m k"], Float[np.ndarray, "n m k"]]:
-    """Return the distance to the edge of the air of candidate and reference, m; negative outside the air."""
-    both = air_voxels(case)
-    return signed_distance(both.judged, both.lattice.edge), signed_distance(both.reference, both.lattice.edge)
-
-
-def signed_distance(free: Bool[np.ndarray, "n m k"], edge: float) -> Float[np.ndarray, "n m k"]:
-    """Return the signed Euclidean distance to the edge of free cells, m."""
-    if free.all() or not free.any():
-        return np.full(free.shape, np.inf if free.all() else -np.inf)
-    return distance_transform_edt(free, edge) - distance_transform_edt(~free, edge)
 
 
 # Distances in the air: around the axis, up and down in lanes, and in vehicle envelopes.

@@ -145,12 +145,7 @@ def _barred_cells(
 
 
 def cell_steps(height: Float[np.ndarray, "n m"], apart: int = 1) -> Float[np.ndarray, "n m"]:
-    """Return the largest difference to the four neighbours, m; beyond the mouths the ground goes on.
-
-    Args:
-        height: Heights of cells, m, `(n, m)`.
-        apart: Columns from a cell to the one beside it.
-    """
+    """Return the largest difference to the cells before, behind and `apart` columns beside, m; mouths go on."""
     along = np.pad(height, ((1, 1), (0, 0)), mode="edge")
     aside = np.pad(height, ((0, 0), (apart, apart)), constant_values=np.nan)
     others = along[2:], along[:-2], aside[:, 2 * apart :], aside[:, : -2 * apart]

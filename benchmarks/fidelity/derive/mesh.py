@@ -65,11 +65,6 @@ def lining_edges(case: Case) -> Edges:
     return mesh_edges(welded_lining(case))
 
 
-@kept_until("MSH", per_case)
-def solid_edges(case: Case) -> Edges:
-    return mesh_edges(welded_solid(case))
-
-
 def weld_offset(case: Case) -> Float[np.ndarray, "3"]:
     """Return the origin that `weld` subtracts from the lining, m."""
     return np.floor(case.candidate.lining.vertices.mean(axis=0))

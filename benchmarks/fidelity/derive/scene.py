@@ -10,7 +10,7 @@ import trimesh
 from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
-from benchmarks.fidelity.candidate import Geoms, Track, load_model, track_of
+from benchmarks.fidelity.candidate import Geoms, load_model, track_of
 from benchmarks.fidelity.case import Case, per_case
 from benchmarks.fidelity.derive.curve import candidate_curve, interpolate_rows
 from benchmarks.fidelity.derive.mesh import face_parts
@@ -48,12 +48,6 @@ def _compile_scene(scene: Path, changed: int) -> mujoco.MjModel:
 @per_case
 def scene_geoms(case: Case) -> Geoms:
     return Geoms.of(scene_model(case))
-
-
-@per_case
-def scene_track(case: Case) -> Track:
-    """Return the track of the compiled scene, whatever the candidate has in memory."""
-    return track_of(scene_geoms(case))
 
 
 def placed_data(model: mujoco.MjModel) -> mujoco.MjData:
@@ -139,9 +133,9 @@ _SEAT_REACH = 0.20  # m between parts of the fastening of one seat
 
 
 def count_assets(case: Case) -> dict[str, int]:
-    """Counts assets by the names of the manifest; a fastener is a clip with its shoulder, two to a seat."""
+    """Counts assets of the compiled scene by the names of the manifest; a fastener is a clip with its shoulder."""
     names = scene_geoms(case).names
-    middle, height = fastening_pieces(scene_track(case).fastening_mesh)
+    middle, height = fastening_pieces(track_of(scene_geoms(case)).fastening_mesh)
     pad = height <= _PAD_HEIGHT
     return {
         "sleepers": sum(name.startswith("sleeper_") for name in names),

@@ -18,11 +18,7 @@ _PARALLEL = 1e-12
 
 
 class Caster:
-    """First hits of rays in a mesh: embree finds the triangle, float64 the place.
-
-    Attributes:
-        mesh: Mesh that rays hit, from both sides.
-    """
+    """First hits of rays in a mesh, from both sides: embree finds the triangle, float64 the place."""
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
         self.mesh = mesh
@@ -33,12 +29,7 @@ class Caster:
     def first(
         self, origin: Float[np.ndarray, "n 3"], direction: Float[np.ndarray, "n 3"]
     ) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, " n"]]:
-        """Return the distance to the first hit, m, and the face hit; `inf` and -1 where a ray meets nothing.
-
-        Args:
-            origin: m, `(n, 3)`.
-            direction: Unit vectors, `(n, 3)`.
-        """
+        """Return the distance to the first hit along unit vectors, m, and the face hit; `inf` and -1 for none."""
         face, reach = np.full(len(origin), -1, np.int64), np.full(len(origin), np.inf)
         if self._rays is not None:
             for start in range(0, len(origin), _CHUNK):
@@ -68,9 +59,6 @@ class Nearest:
     A k-d tree over samples of every triangle proposes triangles, `trimesh` gives the exact closest point of each. Where
     many small triangles crowd around a large one the distance may come out up to `SAMPLE_CELL` too long, but nowhere
     too short.
-
-    Attributes:
-        mesh: Mesh to measure distances to.
     """
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
@@ -91,9 +79,8 @@ class Nearest:
     def _query(
         self, points: Float[np.ndarray, "n 3"]
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
-        proposed = self._face[
-            self._tree.query(points, min(NEAREST_CANDIDATES, len(self._face)))[1].reshape(len(points), -1)
-        ]
+        count = min(NEAREST_CANDIDATES, len(self._face))
+        proposed = self._face[self._tree.query(points, count)[1].reshape(len(points), -1)]
         best = np.full(len(points), np.inf)
         closest, face = np.zeros((len(points), 3)), np.full(len(points), -1)
         for column in range(proposed.shape[1]):

@@ -22,13 +22,9 @@ _GAUGE_STEP = 0.5  # m
 def gauge_along(
     curve: Curve, mesh: trimesh.Trimesh, left: Float[np.ndarray, "k 3"], right: Float[np.ndarray, "k 3"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Measures stations, and the distance between the inner faces of the rails there, every half metre, m.
+    """Measures stations, and the distance between the inner faces of the rails of a mesh there, every half metre, m.
 
-    Args:
-        curve: Curve along which the rails lie.
-        mesh: Mesh of the rails.
-        left: Points of the left rail at the height of its top, in any order.
-        right: Points of the right rail.
+    Either rail is given by points at the height of its top, in any order.
     """
     if min(len(left), len(right)) < 2 or not len(mesh.faces):
         raise ValueError("there are no two rails")
@@ -181,13 +177,9 @@ def _find_rails(
 ) -> Float[np.ndarray, "2 k 3"]:
     """Return the middle of the top of both heads, every metre in which both are seen, m."""
     station = np.arange(curve.station[0] + _RAIL_STEP / 2, curve.station[-1], _RAIL_STEP)
-    tops = np.full((2, len(station), 2), np.nan)
+    tops, high = np.full((2, len(station), 2), np.nan), (height > _HEAD_HEIGHTS[0]) & (height < _HEAD_HEIGHTS[1])
     for side, sign in enumerate((1.0, -1.0)):
-        head = (
-            (np.abs(local[:, 1] - offset - sign * half) < 0.08)
-            & (height > _HEAD_HEIGHTS[0])
-            & (height < _HEAD_HEIGHTS[1])
-        )
+        head = high & (np.abs(local[:, 1] - offset - sign * half) < 0.08)
         points = local[head][np.argsort(local[head, 0])]
         edges = np.searchsorted(points[:, 0], [station - _RAIL_STEP, station + _RAIL_STEP])
         for k, (a, b) in enumerate(edges.T):

@@ -19,7 +19,7 @@ from benchmarks.fidelity import judge, outside, scoring, table
 from benchmarks.fidelity.candidate import Candidate, load_candidate
 from benchmarks.fidelity.case import Case, candidate_hash, case_hash, release_memory
 from benchmarks.fidelity.faults import Fault, Site, kinds, put_in
-from benchmarks.fidelity.files import FidelityError, read_kept, write_csv, write_json
+from benchmarks.fidelity.files import FidelityError, read_kept, write_json
 from benchmarks.fidelity.judge import Judgement
 from benchmarks.fidelity.leaks import find_leaks
 from benchmarks.fidelity.registry import Value, dump_values, evaluate, load_values
@@ -49,14 +49,6 @@ class Outcome:
     values: dict[str, Value]  # Values of all 199 metrics
     leaks: list[str]  # Findings of the leak detector
 
-
-def read_outcome(folder: Path | None, job: Job, key: str) -> Outcome | None:
-    """Return the kept outcome of a job for the same base; `None` where there is none."""
-    content = {} if folder is None else read_kept(folder / f"{job.name}.json", OUTCOME_SCHEMA, key)
-    return Outcome(job, load_values(content["values"]), content["leaks"]) if content else None
-
-
-# The runner.
 
 Evaluate = Callable[..., dict[str, Value]]
 
@@ -97,8 +89,11 @@ def is_bold(job: Job) -> bool:
 
 def run_jobs(bench: Bench, jobs: list[Job], processes: int = 2) -> list[Outcome]:
     """Does the jobs, in their order; those kept from an earlier run of the same base are read."""
-    known = {job: read_outcome(bench.folder, job, bench.key(job)) for job in jobs}
-    done = {job: outcome for job, outcome in known.items() if outcome is not None}
+    done: dict[Job, Outcome] = {}
+    for job in jobs:
+        path = None if bench.folder is None else bench.folder / f"{job.name}.json"
+        if path is not None and (kept := read_kept(path, OUTCOME_SCHEMA, bench.key(job))):
+            done[job] = Outcome(job, load_values(kept["values"]), kept["leaks"])
     todo = [job for job in jobs if job not in done]
     with Stages() as progress:
         stage = progress.start("controls", len(jobs))
@@ -245,7 +240,6 @@ SHARE = 0.95
 _RUNG = 2.0 ** (1.0 / 3.0)  # of a size over the next smaller one
 _BELOW, _ABOVE = 12, 3  # rungs below and above the size asked for
 _EDGE = 4.0  # m that a fault keeps from the mouths: what is squeezed before it lies inside
-_COLUMNS = ("kind", "words", "unit", "length", "places", "asked", "noticed_at_asked", "size_50", "size_95")
 
 
 def check_ladder(kinds: tuple[str, ...], places: int, draw: int = 0) -> None:
@@ -329,10 +323,4 @@ def sum_up(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
             "places": len(rung), "asked": asked.size, "noticed_at_asked": int((rung <= _BELOW).sum()),
             "size_50": half, "size_95": most,
         })  # fmt: skip
-    return table
-
-
-def write_ladder(folder: Path, rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    table = sum_up(rows)
-    write_csv(folder / "ladder.csv", _COLUMNS, table)
     return table

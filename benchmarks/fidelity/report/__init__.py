@@ -64,7 +64,7 @@ def report_content(
     rows = controls or []
     return {
         "schema": SCHEMA,
-        "title": report_title(case),
+        "title": "Fidelity" if case.has("reference") else "Self-consistency",
         "name": case.candidate.name,
         "verdict": judgement.verdict,
         "reasons": judgement.reasons,
@@ -141,10 +141,6 @@ def _outside_entry(judgement: Judgement) -> dict[str, Any] | None:
         "global": judgement.outside["base"].overall,
         "note": "The verdict and all other figures are those of the suite's 199 metrics alone.",
     }
-
-
-def report_title(case: Case) -> str:
-    return "Fidelity" if case.has("reference") else "Self-consistency"
 
 
 def _all_bold(rows: list[dict[str, Any]]) -> bool:

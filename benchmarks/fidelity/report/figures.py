@@ -157,11 +157,7 @@ def draw_unrolled(sheet: Sheet) -> Drawn:
         color = RED if row["beyond"] else INK
         axes.axvspan(row["start"], row["end"], fill=False, ec=color, lw=1.5)
         axes.text(row["start"] + 0.2, 150, str(number), color=color, fontweight="bold")
-    axes.set(
-        xlabel="station, m",
-        yticks=(-180, -90, 0, 90, 180),
-        yticklabels=("right", "floor", "left", "crown", "right"),
-    )
+    axes.set(xlabel="station, m", yticks=_TURN, yticklabels=("right", "floor", "left", "crown", "right"))
     figure.colorbar(picture, label="candidate beyond\nthe reference, cm", extend="both")
     known = int(np.isfinite(one.offset).sum())
     caption = (

@@ -1,6 +1,6 @@
 """Worst windows: what a mean over the whole tunnel hides.
 
 beams ─► deviation ─┐
-bore  ─► relief    ─┼─► measures (values by window) ─► limits.json ─► verdict, report
+bore  ─► relief    ─┼─► judge (values by window, limits.json) ─► verdict, report
 rails ─► track     ─┘
 """

@@ -200,15 +200,7 @@ def shift_by_window(
     """Return how far the relief of the candidate lies along the tunnel from that of points, by window, m.
 
     A wall that is out as a whole does not matter. NaN where the walls are too even to tell, or where no shift within
-    `REACH` fits best.
-
-    Args:
-        station: Station of the points, m.
-        angle: Angle of the points, rad.
-        radius: Distance of the points from the middle, m.
-        judged: Relief of the candidate about the same middle.
-        starts: Starts of the windows, m.
-        window: Their length, m.
+    `REACH` fits best. Points and relief are about the same middle: station, m, angle, rad, and distance from it, m.
     """
     order = np.argsort(station, kind="stable")
     station, radius = station[order], radius[order]

@@ -39,11 +39,6 @@ class Series:
     where: tuple[str, ...]  # Part of the section that each value belongs to; empty for all of it
     window: float  # Length of the windows, m
 
-    @property
-    def judged(self) -> float:
-        """Share of the windows that have a value."""
-        return float(np.isfinite(self.value).mean()) if len(self.value) else 0.0
-
 
 @dataclass(frozen=True)
 class Measure:
@@ -52,7 +47,6 @@ class Measure:
     id: str  # Name
     words: str  # Name for people
     unit: str  # `m` or `1`
-    floor: float  # Least limit: what a good reconstruction may have, whatever calibration finds
     gate: float  # Largest limit, whatever calibration finds
     compute: Callable[[Case, Source], Series]  # Function from case and source to values
 
@@ -66,9 +60,8 @@ def _by_cells(
 ) -> Callable[[Case, Source], Series]:
     def compute(case: Case, source: Source) -> Series:
         one, rows = unrolled(case, source), round(SHORT / deviation.CELL)
-        firsts = np.arange(
-            0, max(len(one.offset) - rows, 0) + 1, round(STEP / deviation.CELL)
-        )  # one window where it is longer
+        last = max(len(one.offset) - rows, 0)  # one window where it is longer
+        firsts = np.arange(0, last + 1, round(STEP / deviation.CELL))
         windows = [one.offset[row : row + rows] for row in firsts]
         found = [statistic(w) if np.isfinite(w).mean() >= _LEAST_CELLS else (np.nan, "") for w in windows]
         values, places = zip(*found, strict=True)
@@ -125,9 +118,8 @@ def _hand(case: Case, source: Source) -> Series:
     firsts = np.arange(0, max(count - rows, 0) + 1, step)
     pairs = [deviation.handedness(one.radius[k : k + rows], judged[k : k + rows]) for k in firsts]
     values = [np.nan if size < _FAINT else 1.0 - agreement for agreement, size in pairs]
-    return Series(
-        one.low + firsts * deviation.CELL, np.asarray(values, float), ("",) * len(firsts), rows * deviation.CELL
-    )
+    starts = one.low + firsts * deviation.CELL
+    return Series(starts, np.asarray(values, float), ("",) * len(starts), rows * deviation.CELL)
 
 
 def _by_profile(
@@ -160,27 +152,27 @@ def _gauge_change(case: Case) -> Samples:
 
 _ANGLE = section_angles(deviation.SECTORS)
 MEASURES = tuple(Measure(*row) for row in (
-    ("wall", "mean distance of the walls", "m", 0.02, 0.05,
+    ("wall", "mean distance of the walls", "m", 0.05,
      _by_cells(lambda cells: (float(np.nanmean(np.abs(cells))), ""))),
-    ("sector", "mean offset of one part of the section", "m", 0.03, 0.08, _by_cells(_worst_sector)),
-    ("aside", "section moved to one side", "m", 0.025, 0.05, _by_cells(_moved(np.cos(_ANGLE)))),
-    ("lift", "section moved up or down", "m", 0.03, 0.05, _by_cells(_moved(np.sin(_ANGLE)))),
-    ("cells", f"share of the surface more than {100 * OFF_CELL:g} cm off", "1", 0.02, 0.2,
+    ("sector", "mean offset of one part of the section", "m", 0.08, _by_cells(_worst_sector)),
+    ("aside", "section moved to one side", "m", 0.05, _by_cells(_moved(np.cos(_ANGLE)))),
+    ("lift", "section moved up or down", "m", 0.05, _by_cells(_moved(np.sin(_ANGLE)))),
+    ("cells", f"share of the surface more than {100 * OFF_CELL:g} cm off", "1", 0.2,
      _by_cells(lambda cells: (float(np.mean(np.abs(cells[np.isfinite(cells)]) > OFF_CELL)), ""))),
-    ("spot", f"one spot of {deviation.CELL:g} m by {360 // deviation.SECTORS:d} degrees", "m", 0.08, 0.3,
+    ("spot", f"one spot of {deviation.CELL:g} m by {360 // deviation.SECTORS:d} degrees", "m", 0.3,
      _by_cells(_worst_spot)),
-    ("shift", "relief of the walls moved along the tunnel", "m", 0.08, 0.15, _shift),
-    ("hand", "left and right exchanged (0 not, 2 mirrored)", "1", 1.2, 1.2, _hand),
-    ("gauge", "error of the gauge", "m", 0.004, 0.006, _by_profile(track.true_gauge_error, None, np.mean, LONG, 8)),
-    ("gauge_change", "gauge against that of the whole track", "m", 0.002, 0.004,
+    ("shift", "relief of the walls moved along the tunnel", "m", 0.15, _shift),
+    ("hand", "left and right exchanged (0 not, 2 mirrored)", "1", 1.2, _hand),
+    ("gauge", "error of the gauge", "m", 0.006, _by_profile(track.true_gauge_error, None, np.mean, LONG, 8)),
+    ("gauge_change", "gauge against that of the whole track", "m", 0.004,
      _by_profile(_gauge_change, None, np.mean, LONG, 8)),
-    ("rail_aside", "track moved to one side", "m", 0.015, 0.03,
+    ("rail_aside", "track moved to one side", "m", 0.03,
      _by_profile(lambda case: track.true_rail_offsets(case)[0], track.seen_rail_side, np.median, SHORT, 8)),
-    ("rail_height", "rails above or below their place", "m", 0.012, 0.02,
+    ("rail_height", "rails above or below their place", "m", 0.02,
      _by_profile(lambda case: track.true_rail_offsets(case)[1], track.seen_rail_height, np.median, SHORT, 8)),
-    ("bed", "height of bed and sleepers, root mean square", "m", 0.03, 0.05,
+    ("bed", "height of bed and sleepers, root mean square", "m", 0.05,
      _by_profile(track.true_bed_error, track.seen_bed_error, rms, SHORT, 15)),
-    ("pockets", "mean error of the pockets' depth", "m", 0.03, 0.06,
+    ("pockets", "mean error of the pockets' depth", "m", 0.06,
      _by_profile(track.true_pocket_error, None, mean_absolute, SHORT, 8)),
 ))  # fmt: skip
 
@@ -197,15 +189,12 @@ def sensor_of(topic: str) -> str | None:
 
 @cache
 def limits(sensor: str = STANDARD_SENSOR) -> dict[str, float | None]:
-    """Return the frozen limits by `id.source`; without a calibration the gates.
+    """Return the frozen limits by `id.source`; those that were not set with a sensor are the standard one's.
 
     `None` where windows in which nothing is wrong lie beyond the gate with this sensor: it cannot judge that measure.
-
-    Args:
-        sensor: LiDAR of the recording; limits that were not set with it are those of the standard one.
     """
-    frozen = json.loads(LIMITS.read_text()) if LIMITS.exists() else {}
-    rows = frozen.get("limits", {}) | frozen.get("sensors", {}).get(sensor, {})
+    frozen = json.loads(LIMITS.read_text())
+    rows = frozen["limits"] | frozen["sensors"].get(sensor, {})
     return {
         f"{one.id}.{source}": rows.get(f"{one.id}.{source}", {}).get("limit", one.gate)
         for one in MEASURES
@@ -276,11 +265,12 @@ def _worst(case: Case, one: Measure, source: Source) -> Worst:
         series = one.compute(case, source)
     except Exception as error:  # a corrupted candidate may break any library
         return replace(nothing, error=f"{type(error).__name__}: {error}"[:200])
-    if not np.isfinite(series.value).any():
+    judged = np.isfinite(series.value)
+    if not judged.any():
         return nothing
     k = int(np.nanargmax(series.value))
     start, end = stations_on_candidate(case, source, series, k)
-    found: dict[str, Any] = {"value": float(series.value[k]), "where": series.where[k], "judged": series.judged}
+    found: dict[str, Any] = {"value": float(series.value[k]), "where": series.where[k], "judged": float(judged.mean())}
     return replace(nothing, start=start, end=end, **found)
 
 

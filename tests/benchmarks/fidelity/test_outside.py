@@ -68,7 +68,7 @@ def test_metrics_are_scored_beside_the_suite_and_leave_it_alone(tmp_path: Path) 
     suite = {id: Value(1.0 if row.map.kind == "P" else row.map.target if row.map.kind == "B" else row.map.good)
              for id, row in table.load().items()}  # fmt: skip
     judged = judge.make_judgement({"base": suite, "null": suite, "ceiling": suite}, [])
-    with_outside = judge.add_outside(judged, case, tmp_path)
+    with_outside = judge.add_outside(judged, case)
     assert with_outside.scored is judged.scored
     assert with_outside.reasons == judged.reasons
     assert judge.constants_digest() == digest
@@ -88,18 +88,6 @@ def test_metrics_are_scored_beside_the_suite_and_leave_it_alone(tmp_path: Path) 
     assert outside.metrics()["lin_given"].number == 200
     assert len(table.load_all()) == 203
     assert len(table.load()) == 199
-
-
-def test_values_of_a_file_are_kept_until_the_file_changes(tmp_path: Path) -> None:
-    file = tmp_path / "mine.py"
-    case = tube.case(tube.Tube(length=6.0))
-    values = []
-    for factor in (1.0, 1.0, 2.0):
-        text = f'metric("lin_mine", "LIN")(lambda case: {factor})\n'
-        file.write_text(HEAD + text)
-        outside.load_file(file)
-        values.append(outside.compute_values(case, {"base": lambda: case.candidate}, tmp_path)["base"]["lin_mine"])
-    assert [value.value for value in values] == [1.0, 1.0, 2.0]
 
 
 DENT = """

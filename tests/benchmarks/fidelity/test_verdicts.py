@@ -164,14 +164,20 @@ def test_a_run_that_was_cut_short_goes_on_with_the_next_candidate(
 
     monkeypatch.setattr(judge, "evaluate", evaluate)
     case = tube.case().fresh()
+
+    def computed() -> dict[str, Values]:
+        with judge.open_values(case, tmp_path) as found:
+            pass
+        return found
+
     with pytest.raises(KeyboardInterrupt):
-        judge.compute_values(case, tmp_path)
+        computed()
     first, done = done, []
-    found = judge.compute_values(case, tmp_path)
+    found = computed()
     assert first == ["tube", "tube as null tube"]
     assert done == ["truth"]
     assert list(found) == ["base", "null", "ceiling"]
-    assert judge.compute_values(case, tmp_path) == found
+    assert computed() == found
     assert len(done) == 1
 
 
