@@ -37,9 +37,8 @@ from scene.survey.bore import draw_bore
 from scene.survey.carrier import IMUS, LIDARS, Carried, calibration, draw_walk, measure_prism
 from scene.survey.cast import Caster, sweeps
 from scene.survey.config import SensorErrors, SurveyConfig
-from scene.survey.conventions import Convention
 from scene.survey.lidar import SCAN_PERIOD, VLP16_RINGS, Lidar, Sweep, avia, vlp16
-from scene.survey.messages import EPOCH
+from scene.survey.messages import EPOCH, Convention
 from scene.survey.simulate import TRUTH_RATE, draw_imu_messages, make_device, write_recording
 from scene.survey.write import write_tum
 from scene.writing.track import lay_track
@@ -182,7 +181,7 @@ def write_case(drive: Drive, case: Case, path: Path) -> Path:
     device = replace(make_device(drive.sensor, config), lidar=drive.lidar)
     seeds = np.random.SeedSequence(1).spawn(len(IMUS[drive.sensor]))
     inertial = draw_imu_messages(seeds, drive.sensor, drive.carried, config)
-    return write_recording(path, device, drive.sweeps, inertial, None, case.convention, len(drive.sweeps))[0]
+    return write_recording(path, device, drive.sweeps, inertial, case.convention, len(drive.sweeps))[0]
 
 
 def read_case(drive: Drive, case: Case, path: Path) -> Row:

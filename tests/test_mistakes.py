@@ -29,7 +29,6 @@ MISTAKES = {
     "scene.survey --out o --truth irregular --correlation 0.5": "correlation must lie between 1 and 4 m",
     "scene.survey --out o --scan-every 0": "scan_every must be at least 1",
     "scene.survey --out o --sensors avia avia": "sensors must differ",
-    "scene.survey --out o --cloud --sensors": "cloud needs a sensor",
     "scene.survey --out o --errors.lost 1.5": "errors.lost must lie between 0 and 1",
     "scene.survey --out o --errors.range-noise nan": "errors.range_noise must not be negative",
     "scene.build": "missing: INPUT",

@@ -153,11 +153,6 @@ def _svg(width: float, height: float, parts: list[str]) -> str:
     return f'<svg viewBox="0 0 {width:.0f} {height:.0f}" role="img">{"".join(parts)}</svg>'
 
 
-def text(value: object) -> str:
-    """Return a value as text that HTML shows as it is."""
-    return escape(str(value))
-
-
 STYLE = """
 body{font:15px/1.45 system-ui,sans-serif;color:#1f2933;max-width:1060px;margin:24px auto;padding:0 16px}
 h1{font-size:24px;margin:0 0 4px}h2{font-size:17px;margin:26px 0 6px;border-bottom:1px solid #d9dee4}
@@ -182,16 +177,16 @@ def render_page(name: str, bore: Bore, judgement: Judgement, content: dict[str, 
     `content` has entries of the manifest.
     """
     parts = [
-        f"<h1>{text(name)}</h1>",
+        f"<h1>{escape(name)}</h1>",
         f"<p>{bore.length:.2f} m long, {bore.width.mean():.2f} m wide, {bore.height.mean():.2f} m high in the mean. "
-        f"{text(judgement.summary().capitalize())}.</p>",
+        f"{escape(judgement.summary().capitalize())}.</p>",
         "<h2>Warnings</h2>", *_warnings(judgement),
         "<h2>Plan</h2>", draw_plan(bore, judgement.returns), _KEY if judgement.returns is not None else "",
         "<h2>Profile</h2>", draw_profile(bore),
     ]  # fmt: skip
     parts += [*_sections(bore, judgement), *_tables(judgement, content)]
     return (
-        f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{text(name)}</title>'
+        f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{escape(name)}</title>'
         f'<meta name="viewport" content="width=device-width"><style>{STYLE}</style></head>'
         f"<body>{''.join(parts)}</body></html>\n"
     )
@@ -200,7 +195,7 @@ def render_page(name: str, bore: Bore, judgement: Judgement, content: dict[str, 
 def _warnings(judgement: Judgement) -> list[str]:
     shown = [(" grave" if one.refuses else "", f"{one.text[:1].upper()}{one.text[1:]}.") for one in judgement.warnings]
     none = ['<p class="good">None: nothing of any size is unexplained, unseen or odd.</p>']
-    return [f'<p class="warn{grave}">{text(words)}</p>' for grave, words in shown] or none
+    return [f'<p class="warn{grave}">{escape(words)}</p>' for grave, words in shown] or none
 
 
 def _sections(bore: Bore, judgement: Judgement) -> list[str]:
@@ -210,7 +205,7 @@ def _sections(bore: Bore, judgement: Judgement) -> list[str]:
         return []
     figures = [
         f"<figure>{draw_section(bore, returns, start, end)}"
-        f"<figcaption>{text(name_span(start, end))}: {share:.1%} unexplained</figcaption></figure>"
+        f"<figcaption>{escape(name_span(start, end))}: {share:.1%} unexplained</figcaption></figure>"
         for start, end, share in worst
     ]
     return [
@@ -248,6 +243,6 @@ def make_table(title: str, rows: list[Any]) -> str:
     """Return a table below its heading; nothing where it has no rows."""
     if not rows:
         return ""
-    shown = [[f"{cell:.5g}" if isinstance(cell, float) else text(cell) for cell in row] for row in rows]
+    shown = [[f"{cell:.5g}" if isinstance(cell, float) else escape(str(cell)) for cell in row] for row in rows]
     cells = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in shown)
     return f"<h2>{title}</h2><table>{cells}</table>"

@@ -243,7 +243,6 @@ def sweeps(
         points = (seen[:, None] * ray).astype(np.float32)
         reflectivity = np.where(valid, draw_reflectivity(rng, hits.cosine, hits.part, factor), 0).astype(np.uint8)
         second = valid & (rng.random(len(ray), np.float32) < _SECOND_RETURN)
-        placed = poses.position + seen[:, None] * heading
         velocity = None
         if doppler:
             times = (begin[:, None] + 1e-9 * offset).ravel()
@@ -255,6 +254,6 @@ def sweeps(
             of = slice(k * n, (k + 1) * n)
             yield Sweep(
                 int(number), round(SCAN_PERIOD * 1e9) * int(number), offset, valid[of], points[of], reflectivity[of],
-                second[of], placed[of],
+                second[of],
                 None if velocity is None else velocity[of],
             )  # fmt: skip

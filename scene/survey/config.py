@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from scene.survey.conventions import Convention
+from scene.survey.messages import Convention
 from subterra_jax.host.texture import check_dial
 
 LidarName = Literal["avia", "vlp16", "os1"]
@@ -54,7 +54,6 @@ class SurveyConfig:
     scan_every: int = 1  # Keep every so many scans of the VLP-16 and the OS1.
     speed: float = 1.0  # Mean walking speed, m/s.
     point_rate: int = 240_000  # Points per second of the Avia; fewer thin the survey.
-    cloud: bool = False  # Also write the first sensor's returns as `cloud.ply`.
     # Errors of the instruments. Zero, or the flag's `no-` form, switches a part off.
     errors: SensorErrors = field(default_factory=SensorErrors)
     # Conventions of drivers that the recordings are written in.
@@ -79,8 +78,6 @@ def check_survey(config: SurveyConfig) -> None:
         raise ValueError(f"scan_every must be at least 1, got {config.scan_every}")
     if len(set(config.sensors)) < len(config.sensors):
         raise ValueError(f"sensors must differ from each other, got {' '.join(config.sensors)}")
-    if config.cloud and not config.sensors:
-        raise ValueError("cloud needs a sensor, got none")
     check_dial(config.texture)
     _check_errors(config.errors)
     config.convention.check()

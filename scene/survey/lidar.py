@@ -50,12 +50,11 @@ class Sweep:
     points: Float32[np.ndarray, "n 3"]  # Points in the LiDAR's frame, m; 0, 0, 0 without a return
     reflectivity: UInt8[np.ndarray, "n"]  # 0 to 150 for 0 to 100 % diffuse; 0 where nothing returned
     second: Bool[np.ndarray, "n"]  # Returns marked as the second of their beam
-    placed: Float[np.ndarray, "n 3"]  # Points in the survey frame by the true poses, m; meaningless where not `valid`
     velocity: Float32[np.ndarray, "n"] | None = None  # Speed of each range, m/s, of a LiDAR that measures it
 
     def pick(self, beams: Int[np.ndarray, "k"]) -> "Sweep":
         """Return a part of it; its begin stays."""
-        names = ("offset", "valid", "points", "reflectivity", "second", "placed", "velocity")
+        names = ("offset", "valid", "points", "reflectivity", "second", "velocity")
         known = {name: values for name in names if (values := getattr(self, name)) is not None}
         return replace(self, **{name: values[beams] for name, values in known.items()})
 

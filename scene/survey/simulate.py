@@ -27,11 +27,10 @@ from scene.survey.carrier import (
 )
 from scene.survey.cast import Caster, Face, n_sweeps, sweeps
 from scene.survey.config import LidarName, SurveyConfig
-from scene.survey.conventions import Convention, Recorder, encode, pieces_of
 from scene.survey.lidar import SCAN_PERIOD, Lidar, Sweep, avia, os1, vlp16
 from scene.survey.mesh import Mesh
-from scene.survey.write import CloudWriter, describe_truth, write_json, write_mesh, write_tum, write_yaml
-from subterra_jax.host.files import replace_file
+from scene.survey.messages import Convention, Recorder, encode, pieces_of
+from scene.survey.write import describe_truth, write_json, write_mesh, write_tum, write_yaml
 
 Message = tuple[int, str, bytes]  # time in ns since the start of the survey, topic, bytes
 
@@ -85,11 +84,10 @@ def write_recording(
     device: Device,
     sweeps: Iterable[Sweep],
     inertial: list[Message],
-    cloud: CloudWriter | None = None,
     convention: Convention = Convention(),  # noqa: B008 (frozen)
     count: int = 0,
 ) -> tuple[Path, int]:
-    """Writes the recording of `count` sweeps, and the returns to `cloud` if asked; returns its path and their number.
+    """Writes the recording of `count` sweeps; returns its path and the number of returns.
 
     A message is recorded when it is complete: a sweep one period after its first point. Sweeps and IMU messages come in
     the order of time.
@@ -109,8 +107,6 @@ def write_recording(
             for piece, lidar in pieces_of(sweep, device.lidar, convention):
                 bag.write(device.topic, end, device.encode(piece, lidar))
             returns += int(sweep.valid.sum())
-            if cloud:
-                cloud.add(sweep.placed[sweep.valid], sweep.reflectivity[sweep.valid])
         while topic:
             bag.write(topic, at, raw)
             at, topic, raw = next(waiting)
@@ -171,13 +167,9 @@ def _simulate_device(
     caster = Caster(mesh, _BEHIND.get(name, one.lidar.range_max))
     seen = sweeps(np.random.default_rng(of_lidar), one.lidar, carried, caster, config.errors, every, face=face)
     count = n_sweeps(carried, every)
-    with ExitStack() as stack:
-        cloud = None
-        if config.cloud and name == config.sensors[0]:
-            cloud = stack.enter_context(CloudWriter(stack.enter_context(replace_file(config.out / "cloud.ply"))))
-        progress = stack.enter_context(Progress(console=console or Console(quiet=True), transient=True))
+    with Progress(console=console or Console(quiet=True), transient=True) as progress:
         tracked = progress.track(seen, total=count, description=f"survey, {name}")
         bag = config.out / f"survey{one.suffix}.bag"
         inertial = draw_imu_messages(of_imus, name, carried, config)
-        _, returns = write_recording(bag, one, tracked, inertial, cloud, config.convention, count)
+        _, returns = write_recording(bag, one, tracked, inertial, config.convention, count)
     return f"{name}: {count} scans, {returns} returns"

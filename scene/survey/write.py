@@ -3,12 +3,11 @@
 import json
 from dataclasses import asdict
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
 import yaml
-from jaxtyping import Float, Shaped
+from jaxtyping import Float
 
 from scene.survey import furniture as fur
 from scene.survey.bore import Bore
@@ -16,8 +15,6 @@ from scene.survey.config import SurveyConfig
 from scene.survey.mesh import Mesh
 from scene.survey.messages import EPOCH
 from subterra_jax.host.files import replace_file
-
-CLOUD_POINT = np.dtype([("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("intensity", "<f4")])
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
@@ -61,42 +58,6 @@ def write_mesh(path: Path, mesh: Mesh) -> None:
         file.write(header.encode())
         file.write(mesh.vertices.astype("<f8").tobytes())
         file.write(faces.tobytes())
-
-
-class CloudWriter:
-    """Writes returns in the survey frame, float64, to a binary PLY as they come."""
-
-    def __init__(self, ply: Path) -> None:
-        self._file, self._count = ply.open("wb"), 0
-        self._write_header()
-
-    def _write_header(self) -> None:
-        # Blanks after the count would break strict readers, so a comment takes up the slack.
-        pad = "x" * (12 - len(str(self._count)))
-        header = (
-            f"ply\nformat binary_little_endian 1.0\ncomment simulated {pad}\nelement vertex {self._count}\n"
-            "property double x\nproperty double y\nproperty double z\nproperty float intensity\nend_header\n"
-        )
-        self._file.seek(0)
-        self._file.write(header.encode())
-
-    def add(self, placed: Float[np.ndarray, "n 3"], intensity: Shaped[np.ndarray, "n"]) -> None:
-        """Appends points, m, in the survey frame."""
-        points = np.empty(len(placed), CLOUD_POINT)
-        points["x"], points["y"], points["z"] = placed.T
-        points["intensity"] = intensity
-        self._count += len(points)
-        self._file.write(points.tobytes())
-
-    def __enter__(self) -> "CloudWriter":
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Puts the final count into the header and closes."""
-        self._write_header()
-        self._file.close()
 
 
 TRUTH_STEP = 0.25  # m between the stations of the truth

@@ -13,11 +13,6 @@ from scipy.spatial.transform import Rotation
 _DIGITS = 5  # behind the point of a coordinate in m
 
 
-def add_element(parent: ET.Element, tag: str, **attributes: str) -> ET.Element:
-    """Adds an element below `parent` and returns it."""
-    return ET.SubElement(parent, tag, attributes)
-
-
 def write_xml(path: Path, root: ET.Element) -> None:
     """Writes an element with all below it, indented, in UTF-8 behind a declaration."""
     ET.indent(root)
@@ -57,7 +52,7 @@ def add_box(
     **attributes: str,
 ) -> None:
     """Adds a fixed box that bodies touch whose affinity has one of `bits`; half sizes and centre in m."""
-    add_element(
+    ET.SubElement(
         world, "geom", name=name, type="box", size=format_numbers(half), pos=format_numbers(centre),
         quat=format_quaternion(rotation), contype=str(bits), conaffinity="0", **attributes,
     )  # fmt: skip
@@ -90,8 +85,8 @@ def add_mesh(
     path = parts.meshes / f"{name}.obj"
     if not (reuse and path.exists()):
         path.write_text(_obj_text(mesh.vertices - origin, mesh.faces, coordinates))
-    add_element(parts.asset, "mesh", name=name, file=path.name, inertia="shell")
-    add_element(
+    ET.SubElement(parts.asset, "mesh", name=name, file=path.name, inertia="shell")
+    ET.SubElement(
         parts.world, "geom", name=name, type="mesh", mesh=name, pos=format_numbers(origin), material=material,
         group=group, contype="0", conaffinity="0",
     )  # fmt: skip

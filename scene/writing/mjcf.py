@@ -21,7 +21,6 @@ from scene.writing.furnished import Furnished, FurnitureConfig
 from scene.writing.markup import (
     SceneParts,
     add_box,
-    add_element,
     add_mesh,
     format_numbers,
     format_quaternion,
@@ -114,15 +113,15 @@ _SHINY = {"rail_head", "galvanised"}
 def make_root(name: str) -> ET.Element:
     """Return the root element with compiler, solver and view."""
     root = ET.Element("mujoco", model=name)
-    add_element(root, "compiler", angle="radian", meshdir="meshes", texturedir="meshes", autolimits="true")
-    add_element(root, "option", timestep="0.004", integrator="implicitfast", iterations="4", ls_iterations="8")
-    add_element(root, "statistic", extent="12")
-    visual = add_element(root, "visual")
-    add_element(visual, "global", offwidth="1920", offheight="1080", fovy="60")
-    add_element(visual, "quality", offsamples="4")
-    add_element(visual, "headlight", ambient="0.28 0.28 0.29", diffuse="0.32 0.32 0.30", specular="0 0 0")
-    add_element(visual, "map", znear="0.005", zfar="60", fogstart="1.5", fogend="14")
-    add_element(visual, "rgba", fog="0.05 0.05 0.05 1", haze="0.6 0.7 0.8 1")
+    ET.SubElement(root, "compiler", angle="radian", meshdir="meshes", texturedir="meshes", autolimits="true")
+    ET.SubElement(root, "option", timestep="0.004", integrator="implicitfast", iterations="4", ls_iterations="8")
+    ET.SubElement(root, "statistic", extent="12")
+    visual = ET.SubElement(root, "visual")
+    ET.SubElement(visual, "global", offwidth="1920", offheight="1080", fovy="60")
+    ET.SubElement(visual, "quality", offsamples="4")
+    ET.SubElement(visual, "headlight", ambient="0.28 0.28 0.29", diffuse="0.32 0.32 0.30", specular="0 0 0")
+    ET.SubElement(visual, "map", znear="0.005", zfar="60", fogstart="1.5", fogend="14")
+    ET.SubElement(visual, "rgba", fog="0.05 0.05 0.05 1", haze="0.6 0.7 0.8 1")
     return root
 
 
@@ -132,17 +131,17 @@ def add_materials(parts: SceneParts, rings: bool, reuse: bool) -> None:
         if not (reuse and (parts.meshes / f"{name}.png").exists()):
             write_png(parts.meshes / f"{name}.png", picture())
     sky = {"builtin": "gradient", "rgb1": "0.55 0.70 0.88", "rgb2": "0.90 0.93 0.96", "width": "64", "height": "384"}
-    add_element(parts.asset, "texture", type="skybox", **sky)
+    ET.SubElement(parts.asset, "texture", type="skybox", **sky)
     for name in ("concrete", "ballast"):
-        add_element(parts.asset, "texture", name=name, type="2d", file=f"{name}.png")
-    add_element(parts.asset, "material", name="concrete", texture="concrete", specular="0.15", shininess="0.2")
-    add_element(parts.asset, "material", name="floor", texture="ballast", specular="0")
+        ET.SubElement(parts.asset, "texture", name=name, type="2d", file=f"{name}.png")
+    ET.SubElement(parts.asset, "material", name="concrete", texture="concrete", specular="0.15", shininess="0.2")
+    ET.SubElement(parts.asset, "material", name="floor", texture="ballast", specular="0")
     repeat = {"texuniform": "true", "texrepeat": "0.7 0.7"}
-    add_element(parts.asset, "material", name="ballast", texture="ballast", **repeat, specular="0")
+    ET.SubElement(parts.asset, "material", name="ballast", texture="ballast", **repeat, specular="0")
     for name, colour in _COLOURS.items():
         gloss = ("0.7", "0.6") if name in _SHINY else ("0.1", "0.1")
-        add_element(parts.asset, "material", name=name, rgba=colour, specular=gloss[0], shininess=gloss[1])
-    add_element(parts.asset, "material", name="lamp", rgba="1 0.97 0.88 1", emission="1")
+        ET.SubElement(parts.asset, "material", name=name, rgba=colour, specular=gloss[0], shininess=gloss[1])
+    ET.SubElement(parts.asset, "material", name="lamp", rgba="1 0.97 0.88 1", emission="1")
 
 
 def add_lights(world: ET.Element, bore: Bore, track: Track, spacing: float) -> int:
@@ -152,7 +151,7 @@ def add_lights(world: ET.Element, bore: Bore, track: Track, spacing: float) -> i
     at = bore.axis.at(station)
     lamp = at.position + (np.interp(station, bore.station, crown) - 0.5)[:, None] * at.up
     for k, position in enumerate(lamp):
-        add_element(
+        ET.SubElement(
             world, "light", name=f"lamp_{k:03d}", pos=format_numbers(position), dir="0 0 -1", cutoff="180",
             exponent="0", attenuation="1 0.05 0.03", diffuse="0.95 0.91 0.80", specular="0.25 0.25 0.22",
             castshadow="false", active="true" if k < LIT else "false",
@@ -176,7 +175,7 @@ def add_cameras(world: ET.Element, bore: Bore, track: Track) -> None:
         position = at.position[0] + across * at.lateral[0]
         position[2] = np.interp(station, bore.station, track.elevation) + height
         axes = format_numbers([*right, *np.cross(right, look)])
-        add_element(world, "camera", name=name, pos=format_numbers(position), xyaxes=axes, fovy="65")
+        ET.SubElement(world, "camera", name=name, pos=format_numbers(position), xyaxes=axes, fovy="65")
 
 
 def add_rover(root: ET.Element, world: ET.Element, bore: Bore, track: Track, lidar_height: float) -> None:
@@ -193,9 +192,9 @@ def add_rover(root: ET.Element, world: ET.Element, bore: Bore, track: Track, lid
         body.set("quat", format_quaternion(yaw))
         world.append(body)
     # MJX tests the pairs that are nearest.
-    custom = add_element(root, "custom")
+    custom = ET.SubElement(root, "custom")
     for name, most in (("max_geom_pairs", "16"), ("max_contact_points", "24")):
-        add_element(custom, "numeric", name=name, data=most)
+        ET.SubElement(custom, "numeric", name=name, data=most)
 
 
 _NEAR_NICHE = 1.0  # m
@@ -227,7 +226,7 @@ def write_scene(
     into the same folder. `walls` are those at the LiDAR's height.
     """
     root = make_root(name)
-    parts = SceneParts(add_element(root, "asset"), add_element(root, "worldbody"), folder / "meshes")
+    parts = SceneParts(ET.SubElement(root, "asset"), ET.SubElement(root, "worldbody"), folder / "meshes")
     parts.meshes.mkdir(exist_ok=True)
     world = parts.world
     add_materials(parts, rings=has_rings(bore), reuse=furnished is not None)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from scene.bore import Bore
 from scene.geometry import Axis
 from scene.writing import markup
-from scene.writing.markup import SceneParts, add_box, add_element
+from scene.writing.markup import SceneParts, add_box
 from scene.writing.mesh import join_meshes
 from scene.writing.track import Line, RailProfile, Track, TrackConfig
 from scene.writing.unrolled import wall_points
@@ -140,7 +140,7 @@ def add_track(parts: SceneParts, axis: Axis, track: Track) -> None:
 def _add_part(parts: SceneParts, name: str, mesh: trimesh.Trimesh, **attributes: str) -> None:
     text = trimesh.exchange.obj.export_obj(mesh, include_normals=False, digits=5, header=None)
     (parts.meshes / f"{name}.obj").write_text(text)
-    add_element(parts.asset, "mesh", name=name, file=f"{name}.obj", **attributes)
+    ET.SubElement(parts.asset, "mesh", name=name, file=f"{name}.obj", **attributes)
 
 
 def _add_sleepers(parts: SceneParts, axis: Axis, line: Line, mark: str) -> None:
@@ -160,11 +160,11 @@ def _add_sleepers(parts: SceneParts, axis: Axis, line: Line, mark: str) -> None:
             "conaffinity": "0",
             "group": "1",
         }
-        add_element(
+        ET.SubElement(
             parts.world, "geom", name=f"sleeper_{mark}{k:04d}", type="mesh", mesh="sleeper", material="sleeper",
             contype=str(SOLID | GROUND | ROLL), **place,
         )  # fmt: skip
-        add_element(
+        ET.SubElement(
             parts.world, "geom", name=f"fastening_{mark}{k:04d}", type="mesh", mesh=f"fastening{mark.rstrip('_')}",
             material="bolt", contype="0", **place,
         )  # fmt: skip

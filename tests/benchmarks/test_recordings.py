@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks import recordings
 from benchmarks.recordings import Case, RecordingsConfig, compare, draw_case, drive_through, read_case, write_case
-from scene.survey.conventions import Convention
+from scene.survey.messages import Convention
 from tests.scene.conftest import arc_bore
 
 

@@ -4,9 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from scene.survey.conventions import Convention, Recorder, encode, pieces_of
 from scene.survey.lidar import Lidar, Sweep
-from scene.survey.messages import CLOUD_TYPE, EPOCH
+from scene.survey.messages import CLOUD_TYPE, EPOCH, Convention, Recorder, encode, pieces_of
 
 RATE, RAYS = 10.0, 400
 OFFSET = np.rint(0.098e9 * np.arange(RAYS) / (RAYS - 1)).astype(np.int64)  # ns
@@ -29,7 +28,7 @@ def write_convention(path: Path, count: int = 12, point_times: str = "header", *
             if k in starts:
                 bag.start_part()
             begin = round((start - EPOCH) * 1e9)
-            sweep = Sweep(k, begin, OFFSET, ~zero, points, zero.astype(np.uint8), zero, points)
+            sweep = Sweep(k, begin, OFFSET, ~zero, points, zero.astype(np.uint8), zero)
             for piece, lidar in pieces_of(sweep, LIDAR, convention):
                 bag.write("/points", begin + 100_000_000, encode(piece, lidar, convention))
     return bag.path

@@ -7,7 +7,7 @@ from benchmarks.rewrite import RewriteConfig, rewrite
 from scene.errors import RecordingError
 from scene.reading.recording import Recording
 from scene.reading.times import Scan, TimeConfig
-from scene.survey.conventions import Convention
+from scene.survey.messages import Convention
 from tests.scene.conventions import sweeps, write_convention
 from tests.scene.messages import pointcloud2, write_bag1
 

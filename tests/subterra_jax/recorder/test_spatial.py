@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 import subterra_jax as st
 from benchmarks.rewrite import RewriteConfig, rewrite
 from scene.reading.recording import Recording
-from scene.survey.conventions import Convention
+from scene.survey.messages import Convention
 from subterra_jax.recorder import RecorderConfig, record
 from subterra_jax.recorder.messages import POINT
 
