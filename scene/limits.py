@@ -59,21 +59,14 @@ def _is_numbers(value: ast.expr) -> bool:
 
 @dataclasses.dataclass(frozen=True)
 class LimitsConfig:
-    """Command line of `python -m scene.limits`.
+    """Command line of `python -m scene.limits`."""
 
-    Attributes:
-        parts: Packages, or modules such as fitting.floor; all where none is given.
-    """
-
+    # Packages, or modules such as fitting.floor; all where none is given.
     parts: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[PART ...]")] = ()
 
 
 def show(parts: tuple[str, ...]) -> None:
-    """Prints the thresholds of a build with their units and reasons.
-
-    Raises:
-        SubterraError: There is no such part.
-    """
+    """Prints the thresholds of a build with their units and reasons; raises `SubterraError` where a part is none."""
     for part in parts:
         if not any(list_limits(part)):
             known = sorted({limit.part for limit in list_limits()})

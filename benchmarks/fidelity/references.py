@@ -109,6 +109,7 @@ def _wrap(angle: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
 # Held-out recording and truth.
 
 TRUTH_SCHEMA = "subterra.truth/1"
+PARTS = ("lining", "joint", "pocket", "nail", "floor", "sleeper", "rail", "fastening")  # of `truth.ply`, by number
 
 
 @dataclass(frozen=True)
@@ -230,11 +231,10 @@ def load_truth(folder: Path, origin: Float[np.ndarray, "3"]) -> Truth:
     if data.get("schema") != TRUTH_SCHEMA:
         raise FidelityError(f"{path}: schema is {data.get('schema')}, not {TRUTH_SCHEMA}")
     surface, part = _read_parts(folder / "truth.ply", origin)
-    names = tuple(data["definitions"]["parts"])
     columns = (np.asarray(data[name], float) for name in ("station", "position", "tangent", "width", "height"))
     station, position, tangent, width, height = columns
     furniture = {name: data[name] for name in ("rings", "pockets", "nails", "sleepers", "rails") if name in data}
-    return Truth(station, position - origin, tangent, width, height, surface, part, names, furniture, origin)
+    return Truth(station, position - origin, tangent, width, height, surface, part, PARTS, furniture, origin)
 
 
 def _read_parts(path: Path, origin: Float[np.ndarray, "3"]) -> tuple[trimesh.Trimesh, Int[np.ndarray, " f"]]:

@@ -3,8 +3,8 @@
 A cloud in which no bore can be seen is refused by the name of what it is.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Annotated
 
 import numpy as np
@@ -103,7 +103,7 @@ def clean_cloud(cloud: Cloud, centreline: CentrelineConfig) -> Cleaned:
     reach = _REACH * maximum_filter1d(course.usual, _AROUND, mode="wrap")
     for _ in range(2):
         tube, ends, own = _sorted_coarse(coarse, count, axis, reach)
-        axis = centre_axis(coarse[own], axis, centreline, _usual_section(axis, tube))
+        axis = centre_axis(coarse[own], axis, centreline, partial(stand_in, tube, axis))
     tube, ends, _own = _sorted_coarse(coarse, count, axis, reach)
     require_crown(tube)
     points = cloud.points.astype(np.float64)
@@ -113,7 +113,7 @@ def clean_cloud(cloud: Cloud, centreline: CentrelineConfig) -> Cleaned:
     if (cause != Cause.KEPT).mean() < _LITTLE:
         cause[:] = Cause.KEPT
     kept = cloud if (cause == Cause.KEPT).all() else part_of_cloud(cloud, np.flatnonzero(cause == Cause.KEPT))
-    usual = _usual_section(axis, tube)
+    usual = partial(stand_in, tube, axis)
     along = axis.at(tube.behind[:, 0])
     hidden = along.position + tube.behind[:, 1:2] * along.lateral + tube.behind[:, 2:] * along.up
     axis = axis.at(np.linspace(*ends, int(np.ptp(ends)) + 1))
@@ -167,10 +167,6 @@ def longest_course(points: Float[np.ndarray, "n 3"], seeds: list[Seed]) -> Cours
 def _holds(course: Course, position: np.ndarray) -> bool:
     off, nearest = cKDTree(course.position).query(position)
     return bool(off < 1.5 * np.median(course.radius[nearest]))
-
-
-def _usual_section(axis: Axis, tube: Tube) -> Callable[[Axis], Float[np.ndarray, "k rays"]]:
-    return lambda at: stand_in(tube, axis, at)
 
 
 def stand_in(tube: Tube, axis: Axis, at: Axis) -> Float[np.ndarray, "k rays"]:

@@ -357,10 +357,8 @@ def _add_nails(
     pairs = pair_pockets(bore, joint)
     seen = find_nails(bore, pairs, cloud) if cloud is not None else None
     if seen is None:
-        return replace(bore, nail=make_nails(bore, pairs, config.nail_depth, config.nail_diameter)), {
-            **provenance,
-            "nails": STANDARD if len(pairs) else NONE,
-        }
+        nails = make_nails(bore, pairs, config.nail_depth, config.nail_diameter)
+        return replace(bore, nail=nails), {**provenance, "nails": STANDARD if len(pairs) else NONE}
     result = make_nails(bore, pairs, seen.depth if seen.present.any() else config.nail_depth, config.nail_diameter)
     result["measured"], result["confidence"] = seen.present, np.where(seen.present, seen.confidence, 0.0)
     if not seen.present.any():

@@ -221,9 +221,8 @@ def _measure(
     levels = [_block_medians(upward, block, rows, len(at)) for rows in heads.values()]
     cant = levels[0] - levels[1]
     known = np.isfinite(cant)
-    smooth = (
-        median_filter(np.interp(at, at[known], cant[known]), 5, mode="nearest") if known.any() else np.zeros(len(at))
-    )
+    even = np.interp(at, at[known], cant[known]) if known.any() else np.zeros(len(at))
+    smooth = median_filter(even, 5, mode="nearest")
     gauge *= np.hypot(1.0, np.median(smooth) / apart)  # along the plane of both heads, not across the level
     return SeenRails(
         at, offset, smooth, apart, float(np.median(gauge)) if len(gauge) else np.nan,

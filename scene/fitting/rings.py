@@ -71,21 +71,10 @@ def bore_from_rings(fit: RingFit, origin: Float[np.ndarray, "3"]) -> Bore:
     radius = np.interp(axis.station, at, fit.radius)
     distance = np.abs(axis.station[:, None] - at[None]).min(axis=1)
     return Bore(
-        station=axis.station,
-        position=axis.position,
-        tangent=axis.tangent,
-        lateral=axis.lateral,
-        up=axis.up,
-        width=2 * radius,
-        height=2 * radius,
-        angle=angle,
-        radius=np.repeat(radius[:, None], len(angle), axis=1),
-        residual_rms=np.interp(axis.station, at, fit.rms),
-        coverage=np.interp(axis.station, at, fit.seen),
-        filled=distance > STATION_STEP,
-        ring_station=at,
-        pocket=np.empty(0, POCKET),
-    )
+        axis.station, axis.position, axis.tangent, axis.lateral, axis.up, 2 * radius, 2 * radius, angle,
+        np.repeat(radius[:, None], len(angle), axis=1), np.interp(axis.station, at, fit.rms),
+        np.interp(axis.station, at, fit.seen), distance > STATION_STEP, at, np.empty(0, POCKET),
+    )  # fmt: skip
 
 
 def _tangents(centre: np.ndarray) -> np.ndarray:
@@ -139,12 +128,8 @@ def _fit_circle(
     around = section_angles()
     gap = np.abs(np.angle(np.exp(1j * (around[:, None] - angle[None])))).min(axis=1)
     middle = centre + a * lateral + b * up + ((points - centre) @ tangent).mean() * tangent
-    return (
-        middle,
-        float(radius),
-        float(np.sqrt(np.mean(misfit(np.array([a, b, radius])) ** 2))),
-        float((gap < np.pi / 8).mean()),
-    )
+    rms = float(np.sqrt(np.mean(misfit(np.array([a, b, radius])) ** 2)))
+    return middle, float(radius), rms, float((gap < np.pi / 8).mean())
 
 
 def fit_ring_survey(

@@ -119,10 +119,10 @@ def _ticks(length: float) -> np.ndarray:
     return np.arange(0.0, length + 1e-9, step)
 
 
-def _station_axis(length: float, height: float, shift: float = 0.0) -> list[str]:
-    scale = (_WIDTH - 2 * _MARGIN - shift) / length
+def _station_axis(length: float, height: float) -> list[str]:
+    scale = (_WIDTH - 2 * _MARGIN) / length
     return [
-        f'<text x="{_MARGIN + shift + s * scale:.0f}" y="{height - 6:.0f}" text-anchor="middle">{s:g} m</text>'
+        f'<text x="{_MARGIN + s * scale:.0f}" y="{height - 6:.0f}" text-anchor="middle">{s:g} m</text>'
         for s in _ticks(length)
     ]
 

@@ -117,20 +117,10 @@ _CLASSES: dict[TruthName, _Class] = {
 
 def _draw_section(rng: np.random.Generator, kind: _Class, length: float, correlation: float) -> Section:
     """Draws width and height (1 σ of 5 cm over 8 to 15 m) and roughness (1 cm over 1 to 2 m, or irregular)."""
-    return Section(
-        kind.shape(),
-        width_field=draw_field(rng, 0.05, rng.uniform(8.0, 15.0)),
-        height_field=draw_field(rng, 0.05, rng.uniform(8.0, 15.0)),
-        roughness=draw_field(
-            rng,
-            _IRREGULAR_SIGMA if kind.rough else _SIGMA,
-            correlation if kind.rough else rng.uniform(1.0, 2.0),
-            dims=2,
-            terms=256,
-        ),
-        widening=kind.widening(length),
-        crossfall=_CROSSFALL if kind.rough else 0.0,
-    )
+    width, height = (draw_field(rng, 0.05, rng.uniform(8.0, 15.0)) for _ in range(2))
+    sigma, run = (_IRREGULAR_SIGMA, correlation) if kind.rough else (_SIGMA, rng.uniform(1.0, 2.0))
+    roughness = draw_field(rng, sigma, run, dims=2, terms=256)
+    return Section(kind.shape(), width, height, roughness, kind.widening(length), _CROSSFALL if kind.rough else 0.0)
 
 
 def draw_bore(

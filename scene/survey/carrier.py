@@ -112,16 +112,11 @@ def prism_from(name: LidarName) -> Float[np.ndarray, "3"]:
 
 def calibration(name: LidarName) -> dict[str, Any]:
     """Return the content of a calibration file of one device, per docs/formats.md."""
-    return {
-        "prism": np.round(prism_from(name), 9).tolist(),
-        "imu": {
-            imu.topic: {
-                "rotation": np.round(imu.mount.rotation, 9).tolist(),
-                "shift": np.round(imu.mount.shift, 9).tolist(),
-            }
-            for imu in IMUS[name]
-        },
+    imus = {
+        imu.topic: {key: np.round(getattr(imu.mount, key), 9).tolist() for key in ("rotation", "shift")}
+        for imu in IMUS[name]
     }
+    return {"prism": np.round(prism_from(name), 9).tolist(), "imu": imus}
 
 
 START, STOP = -10.0, -2.0  # m: from the first mouth; from the second

@@ -93,9 +93,8 @@ def avia(point_rate: int = AVIA_POINT_RATE) -> Lidar:
     """Return the Avia, thinned to `point_rate` points per second; stamped at the start of a sweep."""
     offset = avia_point_times(point_rate)
     line = np.arange(len(offset)) % AVIA_LINES
-    return Lidar(
-        "avia", offset, 0, line, avia_directions, _AVIA_RANGE_MIN, _AVIA_RANGE_MAX, _AVIA_WEAKEST_ECHO, _AVIA_DIVERGENCE
-    )
+    reach = _AVIA_RANGE_MIN, _AVIA_RANGE_MAX
+    return Lidar("avia", offset, 0, line, avia_directions, *reach, _AVIA_WEAKEST_ECHO, _AVIA_DIVERGENCE)
 
 
 VLP16_RINGS = 16
@@ -162,14 +161,5 @@ def os1(columns: int = OS1_COLUMNS, rings: int = OS1_RINGS) -> Lidar:
         return os1_directions(time, phase, kept)
 
     # The manual's 45 m hold for a target of 10 %.
-    return Lidar(
-        "os1",
-        column.repeat(rings),
-        0,
-        np.tile(np.arange(rings), columns),
-        directions,
-        0.5,
-        120.0,
-        0.1 / 45.0**2,
-        1.6e-3,
-    )
+    line = np.tile(np.arange(rings), columns)
+    return Lidar("os1", column.repeat(rings), 0, line, directions, 0.5, 120.0, 0.1 / 45.0**2, 1.6e-3)

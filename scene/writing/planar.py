@@ -171,17 +171,9 @@ def save_tunnel(
 ) -> None:
     """Writes `tunnel.npz`; docs/formats.md says what each field means.
 
-    Args:
-        path: File to write.
-        name: Name of the tunnel.
-        provenance: `measured` or `simulated`.
-        bore: The bore.
-        elevation: z of the track at each station, m.
-        lidar_height: Height of the LiDAR's plane above it, m.
-        variants: Walls by the name of the lining, `smooth` first.
-        furniture: Segments beside the walls by lining, m; none where it is not named.
-        shell: Fields of `scene.writing.planar`; without them and `seams` the file holds the plane alone.
-        seams: The same.
+    `elevation` is the track's z at each station, and `lidar_height` that of the LiDAR's plane above it, m. `variants`
+    are walls by the name of the lining, `smooth` first, and `furniture` segments beside them, m. Without `shell` (of
+    `shell_fields`) and `seams` the file holds the plane alone.
     """
     plan = bore.axis.in_plan()
     facts = {

@@ -55,17 +55,10 @@ def recess_boxes(bore: Bore, pocket: Int[np.ndarray, " r"]) -> list[Float[np.nda
     centre, outward = wall_points(bore, rows["station"], rows["angle"]), wall_normals(bore, pocket)
     around = np.cross(outward, bore.axis.at(rows["station"]).tangent)
     along = np.cross(around, outward)
-    return [
-        np.array(
-            [
-                centre[k] + i * rows["length"][k] / 2 * along[k] + j * rows["width"][k] / 2 * around[k] + d * outward[k]
-                for i in (-1, 1)
-                for j in (-1, 1)
-                for d in (-_LID_OVERLAP, float(rows["depth"][k]))
-            ]
-        )
-        for k in range(len(rows))
-    ]
+    return [np.array([
+        centre[k] + i * rows["length"][k] / 2 * along[k] + j * rows["width"][k] / 2 * around[k] + d * outward[k]
+        for i in (-1, 1) for j in (-1, 1) for d in (-_LID_OVERLAP, float(rows["depth"][k]))
+    ]) for k in range(len(rows))]  # fmt: skip
 
 
 ALONG, AROUND = 0.18, 0.2  # of the grid, m
@@ -114,13 +107,10 @@ def unroll_section(bore: Bore) -> Unrolled:
     seam = taken[np.argmax(gap)] + gap.max() / 2 if len(taken) else 1.5 * np.pi
     order = np.argsort((bore.angle - seam) % (2 * np.pi))
     turn = (bore.angle[order] - seam) % (2 * np.pi)
-    mean = np.interp(
-        np.concatenate([[0.0], turn, [2 * np.pi]]) + seam, bore.angle, bore.radius.mean(0), period=2 * np.pi
-    )
     angle = np.concatenate([[0.0], turn, [2 * np.pi]]) + seam
+    mean = np.interp(angle, bore.angle, bore.radius.mean(0), period=2 * np.pi)
     outline = mean[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
-    around = arc_length(outline)
-    return Unrolled(around, angle)
+    return Unrolled(arc_length(outline), angle)
 
 
 def section_corners(bore: Bore) -> Float[np.ndarray, " c"]:

@@ -109,9 +109,8 @@ def _divide_patch(points: Float[np.ndarray, "r c 3"], above: Float[np.ndarray, "
     error = (local[:, 2] - local[:, :2] @ slope[:2] - slope[2]).reshape(points.shape[:2])
     rows, columns = points.shape[:2]
     if np.abs(error).max() > _PATCH_TOLERANCE and max(rows, columns) > _LEAST:
-        down = (
-            np.ptp(error.mean(axis=1)) > np.ptp(error.mean(axis=0)) if min(rows, columns) > _LEAST else rows > columns
-        )
+        bends = [np.ptp(error.mean(axis=axis)) for axis in (1, 0)]
+        down = bends[0] > bends[1] if min(rows, columns) > _LEAST else rows > columns
         half = (rows if down else columns) // 2
         for part in (slice(None, half + 1), slice(half, None)):
             index = part if down else (slice(None), part)
@@ -188,13 +187,7 @@ def add_niche(world: ET.Element, name: str, corners: Float[np.ndarray, "8 3"]) -
     frame = np.stack([edge / np.linalg.norm(edge) for edge in edges], axis=1)
     turned = frame * [1.0, np.sign(np.linalg.det(frame)), 1.0]
     centre, thin = corners.mean(axis=0), _THICKNESS / 2
-    for side, (axis, sign) in {
-        "back": (2, 1),
-        "near": (0, -1),
-        "far": (0, 1),
-        "below": (1, -1),
-        "above": (1, 1),
-    }.items():
+    for side, axis, sign in (("back", 2, 1), ("near", 0, -1), ("far", 0, 1), ("below", 1, -1), ("above", 1, 1)):
         size = np.where(np.arange(3) == axis, thin, half)
         middle = centre + sign * (half[axis] + thin) * frame[:, axis]
         add_box(world, f"{name}_{side}", size, middle, Rotation.from_matrix(turned), SOLID | LOW_WALL, group="3")
