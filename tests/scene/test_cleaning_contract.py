@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 
-from scene.cleaning.sort import list_removed
-from scene.cleaning.tube import bridge_hanging
+from scene.cleaning.sort import list_removed, sort_points
+from scene.cleaning.tube import Tube, bridge_hanging
 from scene.errors import Cause
 from scene.fitting.assemble import section_middles
 from scene.fitting.section import visible_span
-from scene.geometry import axis_through
+from scene.fitting.unroll import Grid
+from scene.geometry import Around, axis_through
 from tests.scene.clouds import curved_d_bore
 from tests.scene.fits import cleaned, thin
 
@@ -34,6 +35,16 @@ def test_what_was_removed_is_listed_by_stretch_with_its_place_in_the_frame_of_th
     assert sum(part.points for part in removed) == np.count_nonzero(cause)
     there = np.median(cloud.points[cause == Cause.BEYOND], axis=0) + cloud.origin
     np.testing.assert_allclose(removed[-1].place, there, atol=1e-3)
+
+
+def test_a_stray_beyond_a_mouth_is_cut_as_what_lies_beyond_it():
+    grid = Grid.over(0.0, 20.0, 0.5, 120)
+    wall, yes = np.full((grid.rows, 120), 3.0), np.ones((grid.rows, 120), bool)
+    tube = Tube(grid, wall, wall, yes, yes, yes, ~yes, np.empty((0, 3)))
+    station, upward = np.array([10.0, 25.0, 25.0, -5.0, 10.0]), np.array([3.0, 3.0, 3.0, 2.0, 3.5])
+    supported = np.array([True, True, False, False, False])
+    cause = sort_points(Around(station, np.zeros(5), upward), tube, supported, (0.0, 20.0))[1]
+    assert cause.tolist() == [Cause.KEPT, Cause.BEYOND, Cause.BEYOND, Cause.BEYOND, Cause.SCATTERED]
 
 
 @pytest.mark.parametrize("lean", [0.0, 0.25])

@@ -13,12 +13,12 @@ from tests.shared import METRO, SHARED, needs_metro
 COLUMNS = ("POINT", "EASTING", "NORTHING", "ELEVATION")
 
 
-def survey_text(radius: float = 2.9, count: int = 12, per_ring: int = 8) -> str:
-    """Rings every 1.5 m along easting, centres 10 m up."""
+def survey_text(radius: float = 2.9, count: int = 12, per_ring: int = 8, shown: float = 1.0) -> str:
+    """Rings every 1.5 m along easting, centres 10 m up; the first part of each ring is shown."""
     lines = [",".join(COLUMNS)]
     for ring in range(count):
         for point in range(per_ring):
-            turn = 2 * np.pi * point / per_ring
+            turn = 2 * np.pi * shown * point / per_ring
             row = (1000 + 1.5 * ring, 500 + radius * np.cos(turn), 10 + radius * np.sin(turn))
             lines.append(f"{ring}.{point + 1}," + ",".join(f"{value:.4f}" for value in row))
     return "\r\n".join(lines) + "\r\n"
@@ -34,6 +34,14 @@ def test_circles_are_recovered(tmp_path):
     np.testing.assert_allclose(bore.ring_station, 1.5 * np.arange(12), atol=1e-3)
     assert not bore.filled[::6].any()  # stations of rings, 0.25 m apart from the next
     assert bore.filled[3::6].all()
+
+
+def test_a_ring_is_seen_as_far_as_its_points_reach_and_an_eighth_of_a_turn_more(tmp_path):
+    (tmp_path / "s.csv").write_text(survey_text(per_ring=17, shown=0.53125))  # every 11.25°, half a turn
+    fit = fit_rings(read_ring_survey(tmp_path / "s.csv"))
+    np.testing.assert_allclose(fit.radius, 2.9, atol=1e-3)
+    np.testing.assert_allclose(fit.seen, 0.5 + 2 / 16, atol=0.01)
+    np.testing.assert_allclose(bore_from_rings(fit, np.zeros(3)).coverage, 0.625, atol=0.01)
 
 
 def test_one_gross_outlier_does_not_move_a_ring(tmp_path):

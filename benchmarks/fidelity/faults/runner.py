@@ -18,7 +18,8 @@ from scipy.stats import spearmanr
 from benchmarks.fidelity import judge, outside, scoring, table
 from benchmarks.fidelity.candidate import Candidate, load_candidate
 from benchmarks.fidelity.case import Case, candidate_hash, case_hash, release_memory
-from benchmarks.fidelity.faults import Fault, Site, kinds, put_in
+from benchmarks.fidelity.faults import KINDS, Fault, Site, kinds, put_in
+from benchmarks.fidelity.faults.kinds import asked_faults, local_site
 from benchmarks.fidelity.files import FidelityError, read_kept, write_json
 from benchmarks.fidelity.judge import Judgement
 from benchmarks.fidelity.leaks import find_leaks
@@ -247,17 +248,17 @@ def check_ladder(kinds: tuple[str, ...], places: int, draw: int = 0) -> None:
         raise FidelityError(f"places must be at least 1, got {places}")
     if draw < 0:
         raise FidelityError(f"draw must not be negative, got {draw}")
-    if unknown := [name for name in kinds if name not in kinds.asked_faults()]:
-        raise FidelityError(f"no size of {unknown[0]!r} is asked for; a ladder has {', '.join(kinds.asked_faults())}")
+    if unknown := [name for name in kinds if name not in asked_faults()]:
+        raise FidelityError(f"no size of {unknown[0]!r} is asked for; a ladder has {', '.join(asked_faults())}")
 
 
 def rungs(kind: str) -> Float[np.ndarray, " r"]:
-    return kinds.asked_faults()[kind].size * _RUNG ** np.arange(-_BELOW, _ABOVE + 1)
+    return asked_faults()[kind].size * _RUNG ** np.arange(-_BELOW, _ABOVE + 1)
 
 
 def draw_place(kind: str, draw: int, number: int, length: float) -> Fault:
     """Draws place, direction and side of a fault of the size asked for, in a tunnel of `length` m."""
-    every, one = kinds.asked_faults(), kinds.KINDS[kind]
+    every, one = asked_faults(), KINDS[kind]
     asked, place = every[kind], (list(every).index(kind), number)
     rng = np.random.default_rng(np.random.SeedSequence(draw, spawn_key=place))
     start = float(rng.uniform(_EDGE, length - _EDGE - asked.length))
@@ -267,15 +268,15 @@ def draw_place(kind: str, draw: int, number: int, length: float) -> Fault:
 
 def climb_ladders(case: Case, kinds: tuple[str, ...], places: int, draw: int, folder: Path) -> list[dict[str, Any]]:
     """Finds the smallest noticed size at each place; places kept from an earlier run are not done again."""
-    kinds, length = kinds or tuple(kinds.asked_faults()), case.candidate.length
-    least = max(kinds.asked_faults()[name].length for name in kinds) + 2.0 * _EDGE + 1.0
+    kinds, length = kinds or tuple(asked_faults()), case.candidate.length
+    least = max(asked_faults()[name].length for name in kinds) + 2.0 * _EDGE + 1.0
     if length < least:
         raise FidelityError(f"a ladder of these faults needs {least:g} m of tunnel, this one has {length:.1f} m")
     key = sha256(f"{case_hash(case)} {draw}".encode()).hexdigest()
     path = folder / "ladder.json"
     done = {(row["kind"], row["number"]): row for row in read_kept(path, LADDER_SCHEMA, key).get("rows", [])}
     needed = [(kind, number) for number in range(places) for kind in kinds]
-    site = kinds.local_site(case)
+    site = local_site(case)
     before = worst_windows(case)
     with Stages() as progress:
         stage = progress.start("places", len(needed))
@@ -312,14 +313,14 @@ def _climb(site: Site, before: list[Worst], fault: Fault) -> dict[str, Any]:
 def sum_up(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return a row per kind: the smallest sizes that half and 95 % of the places notice; infinite where no size is."""
     table = []
-    for kind, asked in kinds.asked_faults().items():
+    for kind, asked in asked_faults().items():
         rung = np.array([row["rung"] for row in rows if row["kind"] == kind])
         if not len(rung):
             continue
         sizes = np.append(rungs(kind), np.inf)
         half, most = (float(sizes[np.quantile(rung, share, method="higher")]) for share in (0.5, SHARE))
         table.append({
-            "kind": kind, "words": kinds.KINDS[kind].words, "unit": kinds.KINDS[kind].unit, "length": asked.length,
+            "kind": kind, "words": KINDS[kind].words, "unit": KINDS[kind].unit, "length": asked.length,
             "places": len(rung), "asked": asked.size, "noticed_at_asked": int((rung <= _BELOW).sum()),
             "size_50": half, "size_95": most,
         })  # fmt: skip
