@@ -256,13 +256,10 @@ def _both_information(case: Case) -> tuple[degeneracy.ScanInformation, degenerac
     return degeneracy.information(case, True), degeneracy.information(case, False)
 
 
-def _condition(scans: degeneracy.ScanInformation) -> np.ndarray:
-    return scans.translation[:, 2] / scans.translation[:, 0]
-
-
 @metric("deg_axial_info_logratio", "DEG", D(0.0543, 1), gate=True, needs="hold", of=np.median,
         args=(lambda scans: scans.axial,))  # fmt: skip
-@metric("deg_cond_logratio", "DEG", D(0.0823, 1), needs="hold", of=np.median, args=(_condition,))
+@metric("deg_cond_logratio", "DEG", D(0.0823, 1), needs="hold", of=np.median,
+        args=(lambda scans: scans.translation[:, 2] / scans.translation[:, 0],))  # fmt: skip
 @metric("deg_rot_info_logratio", "DEG", D(0.00253, 0.14), needs="hold", of=np.median,
         args=(lambda scans: scans.rotation,))  # fmt: skip
 def information_logratio(case: Case, quantity) -> Samples:

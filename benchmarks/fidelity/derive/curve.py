@@ -1,5 +1,6 @@
 """Coordinates along a curve, and polar profiles about it."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,6 +13,7 @@ from benchmarks.fidelity.case import Case, per_case, per_truth
 from benchmarks.fidelity.derive.surface import Caster
 
 _FINE = 0.1  # m
+_AT_ONCE = 300_000  # points
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +48,9 @@ class Curve:
 
     def local(self, points: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3"]:
         """Return station, left and up of points, m; beyond the ends the curve goes straight on."""
+        return by_parts(self._local, points)
+
+    def _local(self, points: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3"]:
         if not self._fine:
             count = max(int(self.length / _FINE), 2) + 1
             station = np.linspace(self.station[0], self.station[-1], count)
@@ -71,6 +76,12 @@ class Curve:
         """Return the points at station, left and up, m."""
         position, _, left, up = self.frames(local[:, 0])
         return position + local[:, 1:2] * left + local[:, 2:3] * up
+
+
+def by_parts(function: Callable[[np.ndarray], np.ndarray], points: Float[np.ndarray, "k 3"]) -> np.ndarray:
+    """Return a function's rows for so many points at a time that what it needs on its way stays below 100 MB."""
+    starts = range(0, max(len(points), 1), _AT_ONCE)
+    return np.concatenate([function(points[start : start + _AT_ONCE]) for start in starts])
 
 
 def interpolate_rows(

@@ -132,7 +132,6 @@ def first_hits(
 
 _GRID_CELL = (0.5, 0.25, 0.25)  # m along, left, up
 _SAMPLE_SPACING = 0.10  # m between samples of a surface
-_POINTS_AT_ONCE = 300_000  # points, whose coordinates take 100 MB on their way
 _GRID_PAD = 0.3  # m beyond the walls; more would give leaks room to loop in
 _LEAST_PERSISTENCE = 0.05  # m; pairs of less persistence are the grid's
 _FLOOD_HALF = 0.5  # m about the curve, in which the flood starts
@@ -151,11 +150,8 @@ class Grid:
     def occupied(self, points: Float[np.ndarray, "k 3"]) -> Bool[np.ndarray, "a b c"]:
         """Return True for cells with a point in them; points outside the box are left out."""
         cells = np.zeros(self.shape, bool)
-        for start in range(0, len(points), _POINTS_AT_ONCE):
-            local = self.curve.local(points[start : start + _POINTS_AT_ONCE])
-            index = np.floor((local - self.low) / self.cell).astype(int)
-            index = index[((index >= 0) & (index < self.shape)).all(axis=1)]
-            cells[tuple(index.T)] = True
+        index = np.floor((self.curve.local(points) - self.low) / self.cell).astype(int)
+        cells[tuple(index[((index >= 0) & (index < self.shape)).all(axis=1)].T)] = True
         return cells
 
     def on_curve(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

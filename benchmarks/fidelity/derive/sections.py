@@ -162,7 +162,7 @@ class Radii:
 
     def depth(self, points: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, " k"]:
         """Return the depth of points inside the bore, along the ray from the axis, m; negative outside."""
-        return self.depth_local(self.curve.local(points))
+        return curves.by_parts(lambda part: self.depth_local(self.curve.local(part)), points)
 
     def depth_local(self, local: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, " k"]:
         """Return that depth of points given as station, left and up about `curve`, m."""

@@ -129,9 +129,7 @@ def without_figures(reasons: list[str]) -> set[str]:
 def _evaluated_categories(evaluated: str) -> tuple[str, ...] | None:
     if evaluated == "all":
         return None
-    if evaluated == kinds.OUT_OF_SCENE:
-        return tuple(name for name in table.CATEGORIES if name not in ("SCN", "PAR"))
-    return tuple(evaluated.split())
+    return judge.geometry_categories() if evaluated == kinds.OUT_OF_SCENE else tuple(evaluated.split())
 
 
 def _foreign_candidate(bench: Bench) -> Candidate:

@@ -193,7 +193,6 @@ def write_report(
 
 # The forms: CSV files and HTML.
 
-HERE = Path(__file__).parent
 METRIC_COLUMNS = ("id", "category", "value", "unit", "score", "role", "evidence", "status", "ci_low", "ci_high", "n",
                   "null_value", "ceiling_value", "skill", "map", "reason")  # fmt: skip
 
@@ -241,7 +240,9 @@ def write_html(
         {"name": name, "caption": caption, "data": base64.b64encode(path.read_bytes()).decode()}
         for name, (path, caption) in figures.items()
     ]
-    environment = Environment(loader=FileSystemLoader(HERE), autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent), autoescape=True, trim_blocks=True, lstrip_blocks=True
+    )
     environment.filters["figure"] = number_text
     text = environment.get_template("report.html.j2").render(report=report, figures=pictures, controls=controls)
     return write_text(folder / "report.html", text)
