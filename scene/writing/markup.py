@@ -52,10 +52,10 @@ def add_box(
     **attributes: str,
 ) -> None:
     """Adds a fixed box that bodies touch whose affinity has one of `bits`; half sizes and centre in m."""
-    ET.SubElement(
-        world, "geom", name=name, type="box", size=format_numbers(half), pos=format_numbers(centre),
-        quat=format_quaternion(rotation), contype=str(bits), conaffinity="0", **attributes,
-    )  # fmt: skip
+    ET.SubElement(world, "geom", {
+        "name": name, "type": "box", "size": format_numbers(half), "pos": format_numbers(centre),
+        "quat": format_quaternion(rotation), "contype": str(bits), "conaffinity": "0", **attributes,
+    })  # fmt: skip
 
 
 @dataclass(frozen=True)

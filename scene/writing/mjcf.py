@@ -131,13 +131,13 @@ def add_materials(parts: SceneParts, rings: bool, reuse: bool) -> None:
         if not (reuse and (parts.meshes / f"{name}.png").exists()):
             write_png(parts.meshes / f"{name}.png", picture())
     sky = {"builtin": "gradient", "rgb1": "0.55 0.70 0.88", "rgb2": "0.90 0.93 0.96", "width": "64", "height": "384"}
-    ET.SubElement(parts.asset, "texture", type="skybox", **sky)
+    ET.SubElement(parts.asset, "texture", {"type": "skybox", **sky})
     for name in ("concrete", "ballast"):
         ET.SubElement(parts.asset, "texture", name=name, type="2d", file=f"{name}.png")
     ET.SubElement(parts.asset, "material", name="concrete", texture="concrete", specular="0.15", shininess="0.2")
     ET.SubElement(parts.asset, "material", name="floor", texture="ballast", specular="0")
-    repeat = {"texuniform": "true", "texrepeat": "0.7 0.7"}
-    ET.SubElement(parts.asset, "material", name="ballast", texture="ballast", **repeat, specular="0")
+    ballast = {"texuniform": "true", "texrepeat": "0.7 0.7", "specular": "0"}
+    ET.SubElement(parts.asset, "material", {"name": "ballast", "texture": "ballast", **ballast})
     for name, colour in _COLOURS.items():
         gloss = ("0.7", "0.6") if name in _SHINY else ("0.1", "0.1")
         ET.SubElement(parts.asset, "material", name=name, rgba=colour, specular=gloss[0], shininess=gloss[1])

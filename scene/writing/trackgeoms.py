@@ -140,7 +140,7 @@ def add_track(parts: SceneParts, axis: Axis, track: Track) -> None:
 def _add_part(parts: SceneParts, name: str, mesh: trimesh.Trimesh, **attributes: str) -> None:
     text = trimesh.exchange.obj.export_obj(mesh, include_normals=False, digits=5, header=None)
     (parts.meshes / f"{name}.obj").write_text(text)
-    ET.SubElement(parts.asset, "mesh", name=name, file=f"{name}.obj", **attributes)
+    ET.SubElement(parts.asset, "mesh", {"name": name, "file": f"{name}.obj", **attributes})
 
 
 def _add_sleepers(parts: SceneParts, axis: Axis, line: Line, mark: str) -> None:
@@ -160,14 +160,14 @@ def _add_sleepers(parts: SceneParts, axis: Axis, line: Line, mark: str) -> None:
             "conaffinity": "0",
             "group": "1",
         }
-        ET.SubElement(
-            parts.world, "geom", name=f"sleeper_{mark}{k:04d}", type="mesh", mesh="sleeper", material="sleeper",
-            contype=str(SOLID | GROUND | ROLL), **place,
-        )  # fmt: skip
-        ET.SubElement(
-            parts.world, "geom", name=f"fastening_{mark}{k:04d}", type="mesh", mesh=f"fastening{mark.rstrip('_')}",
-            material="bolt", contype="0", **place,
-        )  # fmt: skip
+        ET.SubElement(parts.world, "geom", {
+            "name": f"sleeper_{mark}{k:04d}", "type": "mesh", "mesh": "sleeper", "material": "sleeper",
+            "contype": str(SOLID | GROUND | ROLL), **place,
+        })  # fmt: skip
+        ET.SubElement(parts.world, "geom", {
+            "name": f"fastening_{mark}{k:04d}", "type": "mesh", "mesh": f"fastening{mark.rstrip('_')}",
+            "material": "bolt", "contype": "0", **place,
+        })  # fmt: skip
 
 
 def _heads_apart(line: Line) -> float:
