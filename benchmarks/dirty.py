@@ -24,12 +24,11 @@ from scipy.ndimage import median_filter
 from benchmarks.command import BenchmarkError, run_main, run_module
 from benchmarks.fidelity.derive.surface import Caster, Nearest
 from benchmarks.records import Record, measured, write_records
-from benchmarks.results import environment_facts, markdown_table, write_file
+from benchmarks.results import markdown_table, write_file
 from benchmarks.truth import f1, one_to_one, sleepers_of
 from scene.errors import Code
 from subterra_jax.host.files import require_folder
 
-SCHEMA = "subterra.dirty/3"
 _ENDING = "_truth.npz"
 _INPUTS = (".laz", ".las", ".ply", ".pcd", ".e57", ".xyz", ".csv", ".npz", ".bag", "")
 _ALONG = ("axis_above_floor", "width", "height")  # at each point of the axis, or one for all
@@ -311,7 +310,7 @@ class JudgeConfig:
 
 
 def judge(config: JudgeConfig) -> None:
-    """Judges all cases; writes `dirty.md`, `dirty.json` and `records.json` after each.
+    """Judges all cases; writes `dirty.md` and `records.json` after each, its figures to `rows`.
 
     Raises:
         BenchmarkError: The folder holds no cases, or a truth is none.
@@ -325,8 +324,6 @@ def judge(config: JudgeConfig) -> None:
             write_file(file, (json.dumps(judge_case(case, config), indent=1) + "\n").encode())
         rows.append(json.loads(file.read_text()))
         _progress.print(f"{case.name}: {rows[-1]['verdict']}", markup=False)
-        facts = {"schema": SCHEMA, **environment_facts(), "rows": rows}
-        write_file(config.out / "dirty.json", (json.dumps(facts, indent=1) + "\n").encode())
         write_file(config.out / "dirty.md", as_markdown(rows).encode())
         write_records(config.out / "records.json", records_of(rows))
     print(as_markdown(rows))

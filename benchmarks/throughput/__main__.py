@@ -14,7 +14,7 @@ import subterra_jax as st
 from benchmarks.command import BenchmarkError, run_main
 from benchmarks.records import write_records
 from benchmarks.reference import measure_exactness
-from benchmarks.results import environment_facts, write_file
+from benchmarks.results import environment_facts
 from benchmarks.throughput import report
 from benchmarks.throughput.config import ThroughputConfig, check
 from benchmarks.throughput.loops import environment_loop, measure_jaxnav, require_jaxnav
@@ -48,7 +48,9 @@ def run(config: ThroughputConfig) -> report.Result:
     plans = [st.load_tunnel(name) for name in names[:_COMPARED]]
     made: Any = tunnels.load(names, config.lining) if count > 1 else plans[0]
     lining = config.lining if count == 1 else None  # what is made already has its lining
-    env, params = st.make(config.task, made * config.copies if count > 1 else made, lining, sensor=config.sensor)
+    shown: Any = {} if config.texture is None else {"intensity": True, "texture": config.texture}
+    copies = made * config.copies if count > 1 else made
+    env, params = st.make(config.task, copies, lining, sensor=config.sensor, **shown)
     facts = {
         "name": plans[0].name if count == 1 else config.tunnel,
         "tunnels": count,
@@ -80,7 +82,6 @@ def run_and_report(config: ThroughputConfig) -> int:
         return 1
     print(report.as_text(result))
     if config.out is not None:
-        write_file(config.out / "throughput.json", report.as_json(result).encode())
         write_records(config.out / "records.json", report.records_of(result))
     if result.exactness is not None and result.exactness.n_wrong:
         print("error: the LiDAR disagrees with the reference, so its speed counts for nothing", file=sys.stderr)

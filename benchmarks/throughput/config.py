@@ -27,12 +27,13 @@ class ThroughputConfig:
         copies: Copies of each tunnel, in memory of their own.
         lining: Variant of the walls; the tunnel's usual one if not given.
         sensor: LiDAR, the planar one or as `spin16x64`.
+        texture: Dial of the walls' texture, 0 to 1; where it is given, intensities are observed.
         steps: Steps in one timed call, all within one `lax.scan`.
         repeats: Timed calls.
         seconds: Time limit for all calls of one size, s; a call gets fewer steps to keep to it.
         poses: Random poses at which the planar LiDAR is compared with float64 brute force; 0 skips the comparison.
         seed: Seed for actions, environments and poses.
-        out: Output folder for `throughput.json` and `records.json`.
+        out: Output folder for `records.json`.
     """
 
     n: tuple[int, ...] = ()
@@ -42,6 +43,7 @@ class ThroughputConfig:
     copies: int = 1
     lining: str | None = None
     sensor: str = SENSORS[0]
+    texture: float | None = None
     steps: int = 100
     repeats: int = 20
     seconds: float = 30.0

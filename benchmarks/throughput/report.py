@@ -1,7 +1,5 @@
-"""One run's results: a table, `throughput.json`, and records."""
+"""One run's results: tables, and records."""
 
-import dataclasses
-import json
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,9 +9,9 @@ from benchmarks.results import markdown_table
 from benchmarks.throughput.config import ThroughputConfig
 from benchmarks.throughput.loops import N_BEAMS, Peer
 from benchmarks.throughput.timing import Speed
-from subterra_jax.tasks import constants_digest
+from subterra_jax.parts.spatial_lidar import SENSORS
 
-SCHEMA = "subterra.throughput/3"
+PLANAR = SENSORS[0]
 
 
 @dataclass
@@ -32,34 +30,6 @@ class Result:
         """Returns our median over a peer's by batch size."""
         theirs = {speed.n_envs: speed.quartiles[1] for speed in peer.speeds}
         return {s.n_envs: s.quartiles[1] / theirs[s.n_envs] for s in self.speeds if s.n_envs in theirs}
-
-
-def as_json(result: Result) -> str:
-    """Returns the content of `throughput.json`."""
-    content = {
-        "schema": SCHEMA,
-        "config": dataclasses.asdict(result.config),
-        "environment": result.environment,
-        "constants_sha256": constants_digest(),
-        "tunnel": result.tunnel,
-        "exactness": None if result.exactness is None else dataclasses.asdict(result.exactness),
-        "speed": [_speed(speed, result.n_beams) for speed in result.speeds],
-        "peers": [_peer(peer, result) for peer in result.peers],
-    }
-    return json.dumps(content, indent=2, default=str, allow_nan=False) + "\n"
-
-
-def _speed(speed: Speed, n_beams: int) -> dict[str, Any]:
-    lower, median, upper = speed.quartiles
-    rates = {"q1": lower, "median": median, "q3": upper}
-    return {**dataclasses.asdict(speed), **rates, "ns_per_step": 1e9 / median, "rays_per_second": n_beams * median}
-
-
-def _peer(peer: Peer, result: Result) -> dict[str, Any]:
-    return dataclasses.asdict(peer) | {
-        "speeds": [_speed(speed, N_BEAMS) for speed in peer.speeds],
-        "ratios": {str(n_envs): ratio for n_envs, ratio in result.ratios(peer).items()},
-    }
 
 
 def as_text(result: Result) -> str:
@@ -110,7 +80,9 @@ def records_of(result: Result) -> list[Record]:
             measured("speed/lidar-error", round(error, 2), "mm", command, split=where, n=rays, bound="at most")
         )
     for speed in result.speeds:
-        one = f"{'cpu' if result.environment['platform'] == 'cpu' else 'step'}-{speed.n_envs}"
+        kind = "cpu" if result.environment["platform"] == "cpu" else "step"
+        what = "" if config.sensor == PLANAR else f"-{config.sensor}"
+        one = f"{kind}{what}{'' if config.texture is None else '-texture'}-{speed.n_envs}"
         name = one if count == 1 else f"{count}-tunnels" + ("" if speed.n_envs == 65_536 else f"-{speed.n_envs}")
         rate = round(1e-6 * speed.quartiles[1], 3)
         found.append(measured(f"speed/{name}", rate, "M steps/s", command, split=where, bound="at least"))
@@ -121,4 +93,7 @@ def _words(result: Result) -> str:
     """Return the options that a measurement again needs."""
     config = result.config
     tunnel = f"--tunnel {config.tunnel} --copies {config.copies} " if config.tunnel else ""
-    return f"--task {config.task} {tunnel}--n {' '.join(map(str, config.sizes()))} --poses {config.poses} --peers none "
+    shown = "" if config.sensor == PLANAR else f"--sensor {config.sensor} "
+    shown += "" if config.texture is None else f"--texture {config.texture:g} "
+    sizes = " ".join(map(str, config.sizes()))
+    return f"--task {config.task} {tunnel}{shown}--n {sizes} --poses {config.poses} --peers none "

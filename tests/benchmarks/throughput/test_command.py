@@ -1,12 +1,12 @@
 """The throughput command, at sizes that say nothing about speed."""
 
-import json
 import sys
 
 import pytest
 
 import subterra_jax as st
 from benchmarks import reference
+from benchmarks.records import read_records
 from benchmarks.results import environment_facts
 from benchmarks.throughput import __main__ as command
 from benchmarks.throughput.config import ThroughputConfig
@@ -18,36 +18,26 @@ def run_here(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     return command.main()
 
 
-def test_one_run_writes_speeds_and_the_gate(tmp_path, monkeypatch):
+def test_one_run_writes_speeds_and_the_gate(tmp_path, monkeypatch, capsys):
     size = ("--n", "8", "--steps", "4", "--repeats", "3", "--poses", "500", "--peers", "none")
     arguments = ("--task", "Subterra/TraverseShort-v1", *size, "--out", str(tmp_path / "speed"))
     assert run_here(monkeypatch, *arguments) == 0
-    result = json.loads((tmp_path / "speed" / "throughput.json").read_text())
-    assert result["schema"] == "subterra.throughput/3"
-    assert [speed["n_envs"] for speed in result["speed"]] == [8]
-    for speed in result["speed"]:
-        assert 0 < speed["q1"] <= speed["median"] <= speed["q3"]
-        assert len(speed["steps_per_second"]) == 3
-        assert speed["ns_per_step"] == pytest.approx(1e9 / speed["median"])
-    assert result["speed"][0]["rays_per_second"] == pytest.approx(16 * result["speed"][0]["median"])
-    assert result["exactness"]["n_rays"] == 8000
-    assert result["exactness"]["n_wrong"] == 0
-    assert result["exactness"]["max_error"] < 1e-3
-    assert result["environment"]["jax"]
-    assert result["environment"]["date"]
-    assert result["peers"] == []
-    assert sorted(path.name for path in (tmp_path / "speed").iterdir()) == ["records.json", "throughput.json"]
+    error, speed = read_records(tmp_path / "speed" / "records.json")
+    assert (error.id, error.n, error.bound) == ("speed/lidar-error", 8000, "at most")
+    assert error.value < 1.0
+    assert (speed.id, speed.bound) == ("speed/cpu-8", "at least")
+    assert "8,000 rays: largest error" in capsys.readouterr().out
 
 
 def test_several_tunnels_are_measured_together_and_compared_one_by_one(tmp_path, monkeypatch, capsys):
     quick = ("--n", "4", "--steps", "1", "--repeats", "1", "--poses", "20")
     several = ("--task", "Subterra/StopAtShort-v1", "--tunnel", "open:cast:train:0-1", "--copies", "2")
     assert run_here(monkeypatch, *quick, *several, "--out", str(tmp_path)) == 0
-    result = json.loads((tmp_path / "throughput.json").read_text())
-    assert result["tunnel"]["tunnels"] == 4
-    assert result["exactness"]["n_rays"] == 320
-    assert result["exactness"]["n_wrong"] == 0
-    assert ":train:" in capsys.readouterr().out, "a part of the name was taken for a picture"
+    assert [record.id for record in read_records(tmp_path / "records.json")] == ["speed/4-tunnels-4"]
+    told = capsys.readouterr().out
+    assert "320 rays" in told
+    assert " 0 wrong" in told
+    assert ":train:" in told, "a part of the name was taken for a picture"
     true_scan = reference.lidar.scan
     monkeypatch.setattr(reference.lidar, "scan", lambda *args, **rest: true_scan(*args, **rest) + 0.01)
     assert run_here(monkeypatch, *quick, *several) == 1

@@ -3,6 +3,7 @@
 import pytest
 
 from benchmarks.reference import Agreement
+from benchmarks.results import environment_facts
 from benchmarks.throughput import report
 from benchmarks.throughput.config import ThroughputConfig
 from benchmarks.throughput.loops import Peer
@@ -32,3 +33,12 @@ def test_the_tables_hold_speeds_ratios_and_what_was_left_out(result):
     text = report.as_text(result)
     for said in ("1.9 k to 2.05 k", "jaxnav, 256: out of memory", "500,000.0", "32 k", "4 at 16", "0 wrong"):
         assert said in text, said
+
+
+def test_a_record_names_sensor_and_texture_and_how_to_measure_again(result):
+    result.config = ThroughputConfig(n=(16,), sensor="vlp16", texture=0.5, poses=0)
+    result.environment = environment_facts()
+    result.tunnel["tunnels"], result.exactness = 1, None
+    found = report.records_of(result)
+    assert [record.id for record in found] == ["speed/cpu-vlp16-texture-16", "speed/cpu-vlp16-texture-256"]
+    assert "--sensor vlp16 --texture 0.5 --n 16 --poses 0" in found[0].command
