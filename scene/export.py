@@ -196,7 +196,6 @@ def write_sdf(folder: Path, parts: list[Part], facts: dict[str, Any]) -> None:
 
 
 def _add_shape(link: ET.Element, part: Part, kind: str, uri: str) -> ET.Element:
-    """Add a mesh to a link as `visual` or `collision`; returns its element."""
     shape = ET.SubElement(link, kind, name=f"{part.name}_{kind}")
     geometry = ET.SubElement(ET.SubElement(shape, "geometry"), "mesh")
     ET.SubElement(geometry, "uri").text = uri

@@ -317,7 +317,6 @@ def _is_even(bore: Bore, station: Float[np.ndarray, " k"]) -> Bool[np.ndarray, "
 def _standard_pockets(
     bore: Bore, joints: Float[np.ndarray, " j"], config: LiningConfig, flat_floor: bool
 ) -> Shaped[np.ndarray, " p"]:
-    """Pockets on both sides of each joint, in rows."""
     rows = np.linspace(-config.clock_angle, np.pi + config.clock_angle, max(config.pockets_per_ring, 1))
     station = joints[:, None, None] + config.pocket_offset * np.array([-1.0, 1.0])[None, :, None] + 0 * rows
     angle = rows + 0 * station

@@ -45,7 +45,9 @@ def fit_rings(survey: RingSurvey) -> RingFit:
     centre = np.array([points.mean(axis=0) for points in survey.points])
     _require_order(survey, centre)
     for _ in range(_PASSES):
-        tangent = _tangents(centre)
+        chord = arc_length(centre)
+        tangent = CubicSpline(chord, centre)(chord, 1)
+        tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
         rows = zip(survey.points, survey.offsets, centre, tangent, strict=True)
         fits = [_fit_circle(*row) for row in rows]
         centre = np.array([fit[0] for fit in fits])
@@ -75,12 +77,6 @@ def bore_from_rings(fit: RingFit, origin: Float[np.ndarray, "3"]) -> Bore:
         np.repeat(radius[:, None], len(angle), axis=1), np.interp(axis.station, at, fit.rms),
         np.interp(axis.station, at, fit.seen), distance > STATION_STEP, at, np.empty(0, POCKET),
     )  # fmt: skip
-
-
-def _tangents(centre: np.ndarray) -> np.ndarray:
-    chord = arc_length(centre)
-    tangent = CubicSpline(chord, centre)(chord, 1)
-    return tangent / np.linalg.norm(tangent, axis=1, keepdims=True)
 
 
 def _require_order(survey: RingSurvey, centre: np.ndarray) -> None:

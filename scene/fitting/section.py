@@ -35,7 +35,9 @@ def visible_span(station: np.ndarray, angle: np.ndarray, axis: Axis) -> tuple[fl
     rows = np.flatnonzero(shown)
     if not len(rows):
         raise FitError("no tunnel in the cloud: hardly a section shows most of its circumference", Refusal.UNSEEN)
-    if _share_seen(shown[rows[0] : rows[-1] + 1]) < _DENSE:
+    shown = shown[rows[0] : rows[-1] + 1]
+    runs = np.diff(find_runs(~shown), axis=1)  # long ones are the gaps of a survey
+    if shown.sum() / (len(shown) - runs[runs > _GAP / DENSE_STEP].sum()) < _DENSE:
         why = f"profiles more than {DENSE_STEP:g} m apart leave the wall between them unknown"
         raise FitError(why, Refusal.UNSEEN)
     first, last = grid.start + rows[0] * grid.step, grid.start + (rows[-1] + 1) * grid.step
@@ -43,12 +45,6 @@ def visible_span(station: np.ndarray, angle: np.ndarray, axis: Axis) -> tuple[fl
     station, angle = station[inside], angle[inside]
     start, end = _trim_end(station, first, 1), -_trim_end(-station, -last, 1)
     return _trim_aslant(station, angle, start), -_trim_aslant(-station, angle, -end)
-
-
-def _share_seen(shown: Bool[np.ndarray, " rows"]) -> float:
-    """Share of rows shown; long runs of unseen rows, the gaps of a survey, do not count."""
-    runs = np.diff(find_runs(~shown), axis=1)
-    return float(shown.sum() / (len(shown) - runs[runs > _GAP / DENSE_STEP].sum()))
 
 
 def _trim_end(station: np.ndarray, end: float, behind: float) -> float:

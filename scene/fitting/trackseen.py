@@ -135,10 +135,11 @@ def _find_sleepers(
     if wide.sum() < 3:
         return None
     centre = (first[wide] + last[wide]) / 2 * _BIN
-    spacing = _usual_spacing(centre)
+    apart = np.diff(centre)  # twice as far where a sleeper between was not seen
+    spacing = float(np.mean(apart[apart < _MISSING * np.median(apart)]))
     if not _SPACINGS[0] < spacing < _SPACINGS[1] or wide.sum() < _MIN_SEEN * length / spacing:
         return None
-    if not steadier_than_chance(np.diff(centre)):
+    if not steadier_than_chance(apart):
         return None
     owner = _nearest_sleeper(centre, station[near])
     on_top = (np.abs(station[near] - centre[owner]) < 0.06) & (height[near] > step)
@@ -146,12 +147,6 @@ def _find_sleepers(
     middles = _sleeper_middles(centre, station[near], height[near], protrusion)
     place, measured = _complete_sleepers(middles, spacing, length)
     return SeenSleepers(place, measured, protrusion)
-
-
-def _usual_spacing(centre: np.ndarray) -> float:
-    """Return the mean distance of neighbours, m; those with a sleeper between them that was not seen do not count."""
-    apart = np.diff(centre)
-    return float(np.mean(apart[apart < _MISSING * np.median(apart)]))
 
 
 def _nearest_sleeper(centre: np.ndarray, station: np.ndarray) -> np.ndarray:
@@ -214,7 +209,6 @@ def measure_gauge(seen: SeenTrack, low: Float[np.ndarray, "n 3"], bore: Bore) ->
 
 
 def _beside_rails(points: Float[np.ndarray, "n 3"], bore: Bore, lines: tuple[SeenLine, ...]) -> LowPoints:
-    """Return the points near any rail."""
     low = above_floor(points, bore)
     near = np.zeros(len(low.station), bool)
     for rails in (line.rails for line in lines if line.rails is not None):

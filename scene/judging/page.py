@@ -164,6 +164,7 @@ padding:6px 10px;margin:6px 0}.grave{background:#fdecea;border-color:#c62828}.go
 border-left:4px solid #2f855a;padding:6px 10px}.key i{display:inline-block;width:10px;height:10px;border-radius:5px;
 margin:0 4px 0 12px}
 """
+_NO_WARNING = '<p class="good">None: nothing of any size is unexplained, unseen or odd.</p>'
 _KEY = (
     '<p class="key"><i style="background:#9aa5b1"></i>on the model<i style="background:#d64545"></i>inside the bore'
     '<i style="background:#2f6fde"></i>behind the wall<i style="background:#c9a227"></i>beyond the ends</p>'
@@ -176,11 +177,13 @@ def render_page(name: str, bore: Bore, judgement: Judgement, content: dict[str, 
 
     `content` has entries of the manifest.
     """
+    shown = [(" grave" if one.refuses else "", f"{one.text[:1].upper()}{one.text[1:]}.") for one in judgement.warnings]
+    warnings = [f'<p class="warn{grave}">{escape(words)}</p>' for grave, words in shown]
     parts = [
         f"<h1>{escape(name)}</h1>",
         f"<p>{bore.length:.2f} m long, {bore.width.mean():.2f} m wide, {bore.height.mean():.2f} m high in the mean. "
         f"{escape(judgement.summary().capitalize())}.</p>",
-        "<h2>Warnings</h2>", *_warnings(judgement),
+        "<h2>Warnings</h2>", *(warnings or [_NO_WARNING]),
         "<h2>Plan</h2>", draw_plan(bore, judgement.returns), _KEY if judgement.returns is not None else "",
         "<h2>Profile</h2>", draw_profile(bore),
     ]  # fmt: skip
@@ -190,12 +193,6 @@ def render_page(name: str, bore: Bore, judgement: Judgement, content: dict[str, 
         f'<meta name="viewport" content="width=device-width"><style>{STYLE}</style></head>'
         f"<body>{''.join(parts)}</body></html>\n"
     )
-
-
-def _warnings(judgement: Judgement) -> list[str]:
-    shown = [(" grave" if one.refuses else "", f"{one.text[:1].upper()}{one.text[1:]}.") for one in judgement.warnings]
-    none = ['<p class="good">None: nothing of any size is unexplained, unseen or odd.</p>']
-    return [f'<p class="warn{grave}">{escape(words)}</p>' for grave, words in shown] or none
 
 
 def _sections(bore: Bore, judgement: Judgement) -> list[str]:

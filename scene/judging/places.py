@@ -322,7 +322,6 @@ def measure_overruns(bore: Bore, returns: Returns) -> tuple[float, float]:
 
 
 def _cell_areas(bore: Bore, edges: np.ndarray) -> Float[np.ndarray, "r c"]:
-    """Area of wall in each cell, m²."""
     y, z = bore.radius * np.cos(bore.angle), bore.radius * np.sin(bore.angle)
     girth = np.hypot(np.roll(y, -1, axis=1) - y, np.roll(z, -1, axis=1) - z)
     column = angle_bins(bore.angle + 1e-9, SECTORS)

@@ -331,6 +331,5 @@ def doubt_track(track: Track, seen: SeenTrack, pose_doubt: str | None = None) ->
 
 
 def _spacing(track: Track) -> float:
-    """Mean distance of neighbouring sleepers, m."""
     lines = [line.sleeper_station for line in track.lines if len(line.sleeper_station) > 1]
     return float(sum(line[-1] - line[0] for line in lines) / max(sum(len(line) - 1 for line in lines), 1))

@@ -45,12 +45,6 @@ def _target(shift: list[float], wxyz: list[float]) -> Mount:
     return Mount(Rotation.from_quat([*wxyz[1:], wxyz[0]]).as_matrix(), np.array(shift))
 
 
-def _printed(rotation: list[list[float]], shift: list[float]) -> Mount:
-    """Return a mount whose printed digits are made orthonormal."""
-    u, _, vt = np.linalg.svd(np.array(rotation))
-    return Mount(u @ vt, np.array(shift))
-
-
 # LiDAR coordinates to those of the target, as printed: t, q as w x y z.
 PRISM = _target([0.00947221, -0.308202, -0.365733], [0.999901, -0.00492765, 0.00575961, 0.0117651])  # of γ
 _PRISM_BETA = _target([-0.0108864, 0.293397, -0.452674], [0.999991, 0.000903519, 0.0035434, -0.00220342])
@@ -78,7 +72,8 @@ class Imu:
 
 
 def _mti(rotation: list[list[float]], shift: list[float]) -> Imu:
-    return Imu("/imu/data", "imu_link", 100.0, _printed(rotation, shift), orientation=True)
+    u, _, vt = np.linalg.svd(np.array(rotation))  # printed digits are made orthonormal
+    return Imu("/imu/data", "imu_link", 100.0, Mount(u @ vt, np.array(shift)), orientation=True)
 
 
 IMUS: dict[LidarName, tuple[Imu, ...]] = {

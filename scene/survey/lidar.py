@@ -70,11 +70,6 @@ _AVIA_WEAKEST_ECHO = 0.10 / 190.0**2
 _AVIA_DIVERGENCE = 0.5 * np.deg2rad(np.sqrt(0.03 * 0.28))  # rad; a circle for the maker's 0.03° across by 0.28° upright
 
 
-def avia_point_times(point_rate: int) -> Int[np.ndarray, "n"]:
-    """Return offsets of the points of one message, ns: 0 to 99.996 ms at the full rate."""
-    return (np.arange(round(point_rate * SCAN_PERIOD)) * 1_000_000_000) // point_rate
-
-
 def avia_directions(time: Float[np.ndarray, "n"], phase: Float[np.ndarray, "2"]) -> Float[np.ndarray, "n 3"]:
     """Return unit vectors in the LiDAR frame at times, s, in whole turns of the six lines.
 
@@ -91,7 +86,7 @@ def avia_directions(time: Float[np.ndarray, "n"], phase: Float[np.ndarray, "2"])
 
 def avia(point_rate: int = AVIA_POINT_RATE) -> Lidar:
     """Return the Avia, thinned to `point_rate` points per second; stamped at the start of a sweep."""
-    offset = avia_point_times(point_rate)
+    offset = (np.arange(round(point_rate * SCAN_PERIOD)) * 1_000_000_000) // point_rate
     line = np.arange(len(offset)) % AVIA_LINES
     reach = _AVIA_RANGE_MIN, _AVIA_RANGE_MAX
     return Lidar("avia", offset, 0, line, avia_directions, *reach, _AVIA_WEAKEST_ECHO, _AVIA_DIVERGENCE)

@@ -233,7 +233,6 @@ def pocket_mesh(mouth: Float[np.ndarray, "a b 3"], out: Float[np.ndarray, "3"], 
 
 
 def _floor_mesh(left: Float[np.ndarray, "n 3"], right: Float[np.ndarray, "n 3"], rows: Float[np.ndarray, "n"]) -> Mesh:
-    """Return the floor, straight from the foot of the right wall to that of the left."""
     n_across = int(np.ceil(np.linalg.norm(left - right, axis=1).max() / _FLOOR_CELL)) + 1
     share = np.linspace(0.0, 1.0, n_across)[:, None]
     vertices = right[:, None] + share * (left - right)[:, None]

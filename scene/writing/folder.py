@@ -101,7 +101,6 @@ def state_crs(folder: Path, crs: str) -> None:
 
 
 def _comment(file: Path, text: str) -> None:
-    """Writes a comment into the header of a PLY file."""
     form, version, rest = file.read_bytes().partition(b" 1.0")
     file.write_bytes(form + version + b"\ncomment " + text.encode("ascii", "replace") + rest)
 

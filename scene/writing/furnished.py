@@ -145,14 +145,11 @@ def _stretches(space: TunnelSpace, spacing: float) -> list[tuple[float, float]]:
     return list(zip(edge[:-1].tolist(), edge[1:].tolist(), strict=True))
 
 
-def _rounded(reach: float) -> float:
-    return reach if reach > _ASIDE else 0.0
-
-
 def _walkway(space: TunnelSpace) -> list[Piece]:
     config, pieces = space.config, []
     laid = bool(len(space.track.sleeper_station))
-    least = max(config.gauge, _rounded(space.track_reach) + space.track.config.sleeper_length / 2 + 0.05)
+    aside = space.track_reach if space.track_reach > _ASIDE else 0.0
+    least = max(config.gauge, aside + space.track.config.sleeper_length / 2 + 0.05)
     foot, top = -space.track.config.protrusion if laid else 0.0, config.walkway_height
     rail, half = top + config.handrail_height, config.post_size / 2
     for start, end in _stretches(space, config.post_spacing):
@@ -328,7 +325,6 @@ def _overlaps(bore: Bore, niche: np.void) -> np.ndarray:
 
 
 def _niche_door(corners: Float[np.ndarray, "8 3"]) -> Piece:
-    """Return the door at the back of a niche."""
     grid = corners.reshape(2, 2, 2, 3)
     x, z = grid[1, 0, 1] - grid[0, 0, 1], grid[0, 1, 1] - grid[0, 0, 1]
     half = np.array([min(_DOOR[0], np.linalg.norm(x)), _DOOR[1], min(_DOOR[2], np.linalg.norm(z))]) / 2

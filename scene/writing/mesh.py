@@ -22,7 +22,9 @@ def build_solid(bore: Bore, pockets: bool) -> Manifold:
     With `pockets`, the recesses of the lining are part of the air. Raises `FitError` where sections fold into each
     other.
     """
-    _require_unfolded(bore)
+    if (fold := find_fold(bore)) is not None:
+        why = f"the sections fold into each other at {fold:.1f} m; is the curve too tight for the width?"
+        raise FitError(why, Refusal.FOLDED)
     plane = unrolled.unroll_section(bore)
     boxes, apart = _pocket_rectangles(bore, plane) if pockets else (np.empty((0, 4)), np.zeros(len(bore.pocket), bool))
     sheet = unrolled.triangulate(
@@ -74,13 +76,6 @@ def split_lining(lining: trimesh.Trimesh, bore: Bore, length: float) -> list[tri
     return [part for part in parts if len(part.faces)]
 
 
-def _require_unfolded(bore: Bore) -> None:
-    fold = find_fold(bore)
-    if fold is not None:
-        why = f"the sections fold into each other at {fold:.1f} m; is the curve too tight for the width?"
-        raise FitError(why, Refusal.FOLDED)
-
-
 def _pocket_rectangles(bore: Bore, plane: Unrolled) -> tuple[Float[np.ndarray, "p 4"], Bool[np.ndarray, " p"]]:
     """Each pocket's rectangle in the plane, and whether it is clear of other pockets, the seam and the mouths."""
     pocket, clear = bore.pocket, 0.6 * unrolled.AROUND
@@ -126,7 +121,6 @@ def _close_sheet(
 def _cap_mouths(
     bore: Bore, sheet: Sheet, vertex: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "g 3"]]:
-    """Return the mouths closed with fans about the axis."""
     caps, n = [], len(vertex)
     for k, station in enumerate((0.0, sheet.station.max())):
         ring = np.flatnonzero((sheet.station == station) & ~sheet.rim)

@@ -146,7 +146,7 @@ def _add_part(parts: SceneParts, name: str, mesh: trimesh.Trimesh, **attributes:
 def _add_sleepers(parts: SceneParts, axis: Axis, line: Line, mark: str) -> None:
     at = axis.at(line.sleeper_station)
     offset = np.interp(line.sleeper_station, axis.station, line.offset)
-    tilt = np.interp(line.sleeper_station, axis.station, line.cant / _heads_apart(line))
+    tilt = np.interp(line.sleeper_station, axis.station, line.cant / (line.gauge + 0.07))  # from head to head, m
     for k, z in enumerate(np.interp(line.sleeper_station, axis.station, line.seat)):
         across = at.lateral[k]
         if tilt[k]:
@@ -168,10 +168,6 @@ def _add_sleepers(parts: SceneParts, axis: Axis, line: Line, mark: str) -> None:
             "name": f"fastening_{mark}{k:04d}", "type": "mesh", "mesh": f"fastening{mark.rstrip('_')}",
             "material": "bolt", "contype": "0", **place,
         })  # fmt: skip
-
-
-def _heads_apart(line: Line) -> float:
-    return line.gauge + 0.07  # about, m
 
 
 def add_nails(parts: SceneParts, bore: Bore, chunk: float) -> int:
