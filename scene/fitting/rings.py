@@ -138,17 +138,10 @@ def fit_ring_survey(
     joints = joints_by_number(fit.names, smooth.ring_station)
     bore, provenance = add_standard_lining(smooth, lining, False, joints)
     facts = {
-        "kind": "ring survey",
-        **survey.facts,
-        "rings": len(fit.names),
-        "first_ring": fit.names[0],
-        "last_ring": fit.names[-1],
-        "length_fixed_by": "total-station survey",
-        "radius_mean": float(fit.radius.mean()),
-        "radius_sd": float(fit.radius.std()),
-        **describe_bore(bore),
+        "kind": "ring survey", **survey.facts, "rings": len(fit.names), "first_ring": fit.names[0],
+        "last_ring": fit.names[-1], "length_fixed_by": "total-station survey", "radius_mean": float(fit.radius.mean()),
+        "radius_sd": float(fit.radius.std()), **describe_bore(bore),
         "residual_rms": float(np.sqrt(np.mean(fit.rms**2))),
-        "largest_target_offset": float(max(offset.max() for offset in survey.offsets)),
-        "flat_floor": False,
-    }
+        "largest_target_offset": float(max(offset.max() for offset in survey.offsets)), "flat_floor": False,
+    }  # fmt: skip
     return bore, origin, provenance, facts

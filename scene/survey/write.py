@@ -89,30 +89,18 @@ def describe_truth(bore: Bore, config: SurveyConfig) -> dict[str, Any]:
     frames = alignment.frames(station)
     actual = section.measure(station)
     return {
-        "schema": "subterra.truth/1",
-        "provenance": "simulated",
-        "section_type": bore.section_type,
-        "seed": config.seed,
-        "config": {k: v for k, v in asdict(config).items() if k != "out"},
-        "definitions": DEFINITIONS,
-        "length": alignment.length,
-        "station": rounded(station),
-        "position": rounded(frames.position),
-        "tangent": rounded(frames.tangent, 9),
-        "width": rounded(actual.width),
-        "height": rounded(actual.height),
-        "width_smooth": rounded(section.width(station)),
-        "height_smooth": rounded(section.height(station)),
-        "middle": rounded(actual.middle),
-        "crossfall": section.crossfall,
-        "tracks": list(furniture.tracks),
+        "schema": "subterra.truth/1", "provenance": "simulated", "section_type": bore.section_type, "seed": config.seed,
+        "config": {k: v for k, v in asdict(config).items() if k != "out"}, "definitions": DEFINITIONS,
+        "length": alignment.length, "station": rounded(station), "position": rounded(frames.position),
+        "tangent": rounded(frames.tangent, 9), "width": rounded(actual.width), "height": rounded(actual.height),
+        "width_smooth": rounded(section.width(station)), "height_smooth": rounded(section.height(station)),
+        "middle": rounded(actual.middle), "crossfall": section.crossfall, "tracks": list(furniture.tracks),
         "things": [thing.describe() for thing in bore.things],
         "rings": {"width": furniture.sizes.ring_width, "station": rounded(furniture.joints)},
         "pockets": _describe_pockets(bore),
         "nails": {"diameter": fur.NAIL_DIAMETER, "depth": fur.NAIL_DEPTH, "count": int(furniture.nails.sum())},
-        "sleepers": _describe_sleepers(bore),
-        "rails": _describe_rails(bore, station),
-    }
+        "sleepers": _describe_sleepers(bore), "rails": _describe_rails(bore, station),
+    }  # fmt: skip
 
 
 def _describe_pockets(bore: Bore) -> list[dict[str, Any]]:

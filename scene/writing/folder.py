@@ -147,13 +147,10 @@ def write_geometry(
 def write_manifest(path: Path, content: dict[str, Any], config: Any) -> None:
     """Writes the manifest with schema, config, library versions and the folder's hashes added; keys sorted."""
     whole = {
-        "schema": MANIFEST_SCHEMA,
-        "files": hash_files(path.parent),
-        "builder": VERSION,
-        "config": _json_value(dataclasses.asdict(config)),
-        "versions": library_versions(_LIBRARIES),
+        "schema": MANIFEST_SCHEMA, "files": hash_files(path.parent), "builder": VERSION,
+        "config": _json_value(dataclasses.asdict(config)), "versions": library_versions(_LIBRARIES),
         **_json_value(content),
-    }
+    }  # fmt: skip
     path.write_text(json.dumps(whole, indent=2, sort_keys=True) + "\n")
 
 
@@ -189,16 +186,11 @@ def _describe_scene(
     bore = result.bore
     assets = {**track_provenance(track, result.seen), **result.provenance}
     return {
-        "name": name,
-        "inputs": result.inputs,
-        "input_provenance": provenance,
-        "frame": {"origin": result.origin, "up": "z", "length_unit": "m", "crs": result.facts.get("crs")},
-        "seeds": {},
+        "name": name, "inputs": result.inputs, "input_provenance": provenance,
+        "frame": {"origin": result.origin, "up": "z", "length_unit": "m", "crs": result.facts.get("crs")}, "seeds": {},
         "detected": result.facts,
         "bore": {
-            "length": bore.length,
-            "width_mean": float(bore.width.mean()),
-            "height_mean": float(bore.height.mean()),
+            "length": bore.length, "width_mean": float(bore.width.mean()), "height_mean": float(bore.height.mean()),
             "filled_share": float(bore.filled.mean()),
         },
         "count": {
@@ -213,4 +205,4 @@ def _describe_scene(
             **furnished,
             **{asset: kind.replace("measured", provenance) for asset, kind in assets.items()},
         },
-    }
+    }  # fmt: skip

@@ -44,13 +44,10 @@ def shell_fields(
     common = set.intersection(*(set(bricks) for bricks in scenes.values()))
     first = next(iter(scenes.values()))
     fields: dict[str, np.ndarray] = {
-        "shell_height": bore.position[:, 2] - elevation,
-        "shell_rise": bore.tangent[:, 2],
-        "shell_angle": bore.angle,
-        "shell_section": bore.radius.mean(axis=0),
-        "shell_radius": bore.radius,
+        "shell_height": bore.position[:, 2] - elevation, "shell_rise": bore.tangent[:, 2], "shell_angle": bore.angle,
+        "shell_section": bore.radius.mean(axis=0), "shell_radius": bore.radius,
         "shell_track": _rows([row for name, row in first.items() if name in common]),
-    }
+    }  # fmt: skip
     for name, variant in variants.items():
         pocket = variant.bore.pocket if variant.recesses else variant.bore.pocket[:0]
         columns = [pocket[field] for field in ("station", "angle", "length", "width", "depth")]
@@ -177,21 +174,13 @@ def save_tunnel(
     """
     plan = bore.axis.in_plan()
     facts = {
-        "name": name,
-        "provenance": provenance,
-        "lidar_height": lidar_height,
-        "ring_pitch": ring_pitch(bore),
-        "lining": list(variants),
-        **(seams or {}),
-    }
+        "name": name, "provenance": provenance, "lidar_height": lidar_height, "ring_pitch": ring_pitch(bore),
+        "lining": list(variants), **(seams or {}),
+    }  # fmt: skip
     arrays = {
-        "station": bore.station,
-        "centre": plan.position[:, :2],
-        "tangent": plan.tangent[:, :2],
-        "elevation": elevation,
-        "half_width": half_widths(variants["smooth"], bore),
-        **(shell or {}),
-    }
+        "station": bore.station, "centre": plan.position[:, :2], "tangent": plan.tangent[:, :2], "elevation": elevation,
+        "half_width": half_widths(variants["smooth"], bore), **(shell or {}),
+    }  # fmt: skip
     for variant, walls in variants.items():
         arrays |= {f"left_{variant}": walls.left, f"left_station_{variant}": walls.left_station}
         arrays |= {f"right_{variant}": walls.right, f"right_station_{variant}": walls.right_station}

@@ -219,40 +219,30 @@ def describe_track(track: Track, seen: SeenTrack) -> dict[str, Any]:
     shown = seen.lines if len(seen.lines) == len(track.lines) else (SeenLine(None, None),) * len(track.lines)
     lines = [_describe_line(line, of.rails) for line, of in zip(track.lines, shown, strict=True)]
     first: dict[str, Any] = lines[0] if lines else {}
+    laid = track.why or ("as the survey shows it" if any(of.rails or of.sleepers for of in shown) else "by standard")
     return {
-        "lay": track.config.lay,
-        "laid": track.why
-        or ("as the survey shows it" if any(of.rails or of.sleepers for of in shown) else "by standard"),
-        "least_clearance": float(track.clearance.min()) if len(track.clearance) else None,
-        "slab": track.raised,
+        "lay": track.config.lay, "laid": laid,
+        "least_clearance": float(track.clearance.min()) if len(track.clearance) else None, "slab": track.raised,
         "sleepers_seen": int(track.measured.sum()),
-        "protrusion": track.config.protrusion if len(track.sleeper_station) else None,
-        "gauge": first.get("gauge"),
-        "gauge_seen": first.get("gauge_seen"),
-        "gauge_spread": first.get("gauge_spread"),
-        "rail_top_seen": first.get("rail_top_seen"),
-        "lines": lines,
-    }
+        "protrusion": track.config.protrusion if len(track.sleeper_station) else None, "gauge": first.get("gauge"),
+        "gauge_seen": first.get("gauge_seen"), "gauge_spread": first.get("gauge_spread"),
+        "rail_top_seen": first.get("rail_top_seen"), "lines": lines,
+    }  # fmt: skip
 
 
 def _describe_line(line: Line, rails: SeenRails | None) -> dict[str, Any]:
     known = rails is not None and rails.measured
     return {
-        "gauge": line.gauge,
-        "gauge_from": "measured" if line.gauge_measured else "by standard",
+        "gauge": line.gauge, "gauge_from": "measured" if line.gauge_measured else "by standard",
         "gauge_seen": rails.gauge if rails is not None and known else None,
         "gauge_spread": rails.spread if rails is not None and known else None,
         "gauge_pieces": rails.pieces if rails is not None else 0,
-        "rail_top_seen": rails.top if rails is not None else None,
-        "rail_height": line.rail_height,
-        "offset": [float(line.offset.min()), float(line.offset.max())],
-        "cant_mean": float(np.mean(line.cant)),
-        "cant_spread": float(np.std(line.cant)),
-        "cant_from": "measured" if rails is not None else "by standard",
-        "sleepers": len(line.sleeper_station),
-        "sleepers_seen": int(line.measured.sum()),
+        "rail_top_seen": rails.top if rails is not None else None, "rail_height": line.rail_height,
+        "offset": [float(line.offset.min()), float(line.offset.max())], "cant_mean": float(np.mean(line.cant)),
+        "cant_spread": float(np.std(line.cant)), "cant_from": "measured" if rails is not None else "by standard",
+        "sleepers": len(line.sleeper_station), "sleepers_seen": int(line.measured.sum()),
         "sleepers_left_out": line.left_out,
-    }
+    }  # fmt: skip
 
 
 def track_provenance(track: Track, seen: SeenTrack) -> dict[str, str]:
