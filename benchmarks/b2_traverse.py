@@ -168,7 +168,7 @@ def records_of(arguments: Command, figures: dict[str, float]) -> list[Record]:
         interval = wilson(rate, n) if stem in end else None
         records.append(
             measured(
-                f"{name}/{stem or figure}" if unit in ("percent", "deg") else f"{name}/{figure.replace('_', '-')}",
+                f"{name}/{(stem if unit in ('percent', 'deg') else figure).replace('_', '-')}",
                 float(f"{value:.3g}"), _UNITS.get(unit, ""), f"benchmarks.b2_traverse {words}",
                 interval=interval, tolerance=100.0 * 1.96 * math.sqrt(0.25 / n) if stem in end else 0.1 * abs(value),
                 **further,

@@ -1,6 +1,6 @@
-"""Draws a scene, walls, or the film of an episode.
+"""Draws a scene, walls, the film of an episode, or the transfer to a rover.
 
-`python -m benchmarks.draw scene build/tunnel --out view.png`; likewise `film` and `walls`.
+`python -m benchmarks.draw scene build/tunnel --out view.png`; likewise `film`, `walls` and `transfer`.
 `--help` after one of them says more.
 """
 
@@ -9,7 +9,7 @@ from importlib import import_module
 
 from subterra_jax.pictures.renderer import choose_gl
 
-COMMANDS = ("scene", "film", "walls")
+COMMANDS = ("scene", "film", "walls", "transfer")
 
 
 def main(words: list[str] | None = None) -> int:
