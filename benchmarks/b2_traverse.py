@@ -27,6 +27,7 @@ from subterra_jax.evaluation import Episodes
 from subterra_jax.host.files import require_file
 from subterra_jax.host.task_ids import full_id
 from subterra_jax.policies.opening import open_agent
+from subterra_jax.policies.trained import Trained
 from subterra_jax.tunnel.sources import load_tunnel
 from train.log import print_table
 from train.tunnels import names_of
@@ -49,6 +50,8 @@ class Command:
     jobs: int = 1  # Processes that share the robots; for `--engine mujoco`.
     # Driver: a baseline, a run folder of `train`, a policy's file or name, or code as `FILE.py:Class`.
     agent: str = "dead-reckoning"
+    # Largest speed of a trained driver, m/s; its own if not given. A rover reaches 1.5, and slips less below.
+    speed: float | None = None
     policy: str = RELEASED  # Gait: a file, the name of a released gait, or `trot`.
     engine: Literal["mjx", "mujoco"] = "mjx"  # `mjx`, or `mujoco` in C on the host.
     tunnel: str | None = None  # Tunnels, files or names as `open:val:0-7`; the task's own if not given.
@@ -73,6 +76,8 @@ def _check(arguments: Command) -> None:
         raise BenchmarkError(f"jobs = {arguments.jobs} is for engine = mujoco")
     if arguments.coverage is not None and not 0.0 < arguments.coverage <= 1.0:
         raise ValueError(f"coverage must be above 0 and at most 1, got {arguments.coverage}")
+    if arguments.speed is not None and not 0.0 < arguments.speed < math.inf:
+        raise ValueError(f"speed must be above 0, got {arguments.speed}")
     if not 0.0 <= arguments.length < math.inf:
         raise ValueError(f"length must not be negative, got {arguments.length}")
     if arguments.scene is not None and arguments.tunnel is not None:
@@ -113,9 +118,20 @@ def _drive(arguments: Command, share: int = 0) -> tuple[transfer.Walk, transfer.
         severity=levels[index // count % len(levels)].astype(np.int32),
         group=0 * index,
     )
-    agent = open_agent(arguments.agent, env, params)
+    agent = _slowed(open_agent(arguments.agent, env, params), arguments)
     watch = show_progress if arguments.jobs == 1 else None
     return *transfer.walk_robots(env, params, agent, episodes, watch), jax.device_get(params)
+
+
+def _slowed(agent: Any, arguments: Command) -> Any:
+    """Returns a trained agent whose commands end at the speed that is asked for, in its own memory too."""
+    if arguments.speed is None:
+        return agent
+    if not isinstance(agent, Trained):
+        raise BenchmarkError(f"speed = {arguments.speed:g} is for a trained driver, and {arguments.agent} is none")
+    if hasattr(agent, "speed"):
+        return dataclasses.replace(agent, speed=arguments.speed)
+    return dataclasses.replace(agent, high=agent.high.at[0].min(arguments.speed))
 
 
 def _drive_all(arguments: Command) -> tuple[transfer.Walk, transfer.Row, Any]:
@@ -153,7 +169,8 @@ def command(arguments: Command) -> None:
 
 def records_of(arguments: Command, figures: dict[str, float]) -> list[Record]:
     """Returns the figures as records `b2/ROBOT/TASK/ENGINE/AGENT/FIGURE`, of wheels without an engine."""
-    n, agent = arguments.robots, Path(arguments.agent).stem
+    n, agent = arguments.robots, Path(arguments.agent).name.removesuffix(".safetensors")
+    agent += "" if arguments.speed is None else f"-at-{arguments.speed:g}"
     task = "B2Traverse-v1" if arguments.robot == "b2" else arguments.task
     name = "/".join(["b2", arguments.robot, task, *([] if arguments.robot == "wheels" else [arguments.engine]), agent])
     given = {field.name: getattr(arguments, field.name) for field in dataclasses.fields(arguments)}

@@ -97,7 +97,7 @@ def drive_episode(config: FilmConfig) -> tuple[Drawn, float, View | None]:
         raise BenchmarkError(f"scene = {config.scene} is for a robot by physics, and brings its own tunnel")
     source = config.tunnel or first_tunnel(id, spatial)
     plan = st.load_tunnel(source if config.scene is None else tunnel_of(config.scene), solid=spatial)
-    env, params = st.make(id, tunnel=plan, sensor=config.sensor, **physics)
+    env, params = st.make(id, tunnel=plan if config.scene is None else None, sensor=config.sensor, **physics)
     agent = policies.open_agent(config.agent, env, params)
     if piece := TASKS[id].piece if id in TASKS else None:
         plan = plan.slice(piece[0], min(piece[1], plan.length - piece[0]))

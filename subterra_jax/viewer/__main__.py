@@ -86,7 +86,8 @@ def view(settings: argparse.Namespace) -> None:
         physics["engine"] = "mujoco"
     if physics and settings.scene is not None:
         physics["scene"] = settings.scene
-    env, params = st.make(task, tunnel=plan, lining=settings.lining, sensor=sensor, **physics)
+    given = None if "scene" in physics else plan
+    env, params = st.make(task, tunnel=given, lining=settings.lining, sensor=sensor, **physics)
     agent = open_agent(settings.driver, env, params)
     piece = TASKS[task].piece if task in TASKS else None
     shown = plan if piece is None else plan.slice(piece[0], min(piece[1], plan.length - piece[0]))

@@ -24,6 +24,15 @@ def test_a_film_has_as_many_pictures_as_asked_and_they_move(episode):
     assert min(np.abs(shown[0] - shown[1]).mean(), np.abs(shown[1] - shown[2]).mean()) > 0.5
 
 
+def test_a_robot_by_physics_is_seen_from_behind_above_the_plan(episode):
+    plain, seen = (
+        Image.open(io.BytesIO(film.film(*episode[:2], "a title", 2, view)))
+        for view in (None, lambda row: np.full((340, 760, 3), (255, 0, 0), np.uint8))
+    )
+    assert seen.size[1] > plain.size[1]
+    assert np.asarray(seen.convert("RGB"), int)[200, 400] @ [1, -1, -1] > 200
+
+
 def test_beams_end_at_the_walls_that_are_drawn(episode):
     """The returns, turned into the tunnel's direction, lie on the walls within the noise of a range."""
     drawn, *_ = episode

@@ -1,11 +1,13 @@
 """What the recorder adds to an episode: poses in three dimensions, an IMU; known answers."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 import subterra_jax as st
+from subterra_jax.host import rover
 from subterra_jax.recorder.sensors import GRAVITY, Poses, measure_imu, reckoned_poses, true_poses
 from subterra_jax.recorder.trace import Trace
 from subterra_jax.state import State
@@ -43,6 +45,18 @@ def test_on_a_grade_the_robot_is_pitched_by_it_and_facing_back_it_looks_down():
     np.testing.assert_allclose(ahead[:, 2], np.array([1.0, -1.0]) * np.sin(np.arctan(0.03)), atol=1e-6)
     np.testing.assert_allclose(poses.rotation.apply([0.0, 1.0, 0.0])[:, 2], 0.0, atol=1e-9)
     np.testing.assert_allclose(poses.position[:, 2], 0.03 * station, atol=1e-9)
+
+
+def test_a_rover_leans_as_its_trunk_does_over_the_point_where_it_stands():
+    turn = Rotation.from_euler("ZYX", [[0.4, 0.2, -0.1]])
+    where = np.array([[1.0, 2.0, 0.5]]) + rover.HEIGHT * turn.apply([0.0, 0.0, 1.0])
+    body = SimpleNamespace(qpos=np.hstack([where, turn.as_quat()[:, [3, 0, 1, 2]]]))
+    ride = SimpleNamespace(body=body, anchor=np.array([1]))
+    states = SimpleNamespace(parts={"rover": ride})
+    track = SimpleNamespace(position=np.array([[0.0, 0.0, 0.0], [10.0, 20.0, 30.0]]))
+    poses = true_poses(of_states(states, 1), st.load_tunnel("control"), track)
+    np.testing.assert_allclose(poses.position, [[11.0, 22.0, 30.5]], atol=1e-9)
+    np.testing.assert_allclose(poses.rotation.as_matrix(), turn.as_matrix(), atol=1e-9)
 
 
 def test_an_odometer_without_errors_reckons_the_true_path():
