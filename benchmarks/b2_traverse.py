@@ -172,12 +172,14 @@ def records_of(arguments: Command, figures: dict[str, float]) -> list[Record]:
     n, agent = arguments.robots, Path(arguments.agent).name.removesuffix(".safetensors")
     agent += "" if arguments.speed is None else f"-at-{arguments.speed:g}"
     task = "B2Traverse-v1" if arguments.robot == "b2" else arguments.task
+    place = arguments.scene or arguments.tunnel
+    task += "" if place is None or ":" in str(place) else f"-in-{Path(place).stem}"
     name = "/".join(["b2", arguments.robot, task, *([] if arguments.robot == "wheels" else [arguments.engine]), agent])
     given = {field.name: getattr(arguments, field.name) for field in dataclasses.fields(arguments)}
     usual = {field.name: field.default for field in dataclasses.fields(arguments)}
     changed = {key: value for key, value in given.items() if value != usual[key] and key not in ("out", "jobs")}
     words = " ".join(f"--{key} {value}" for key, value in changed.items())
-    further = {"n": n, "split": str(arguments.scene or arguments.tunnel or "the task's own tunnels")}
+    further = {"n": n, "split": str(place or "the task's own tunnels")}
     records = []
     for figure, value in figures.items():
         stem, _, unit = figure.rpartition("_")

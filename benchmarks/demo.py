@@ -105,7 +105,7 @@ def main(config: DemoConfig) -> None:
             print(", ".join(f"{name} {value}" for name, value in loaded.items()))
         with timed(seconds, "film", "4/5 Filming what was learnt: the rover by physics, in the scene just built"):
             judging = beside.submit(compare, scene, truth := load_truth(survey / "truth.json"))
-            words = ("--motion", "rover", "--scene", scene, "--pictures", 60, "--out", out / "film.webp")
+            words = ("--motion", "rover", "--scene", scene, "--pictures", 40, "--out", out / "film.webp")
             _run("benchmarks.draw", "film", "--task", TASK, *seed, "--agent", run, *words)
     with timed(seconds, "report", "5/5 Writing the report"):
         summary: dict[str, Any] = {
