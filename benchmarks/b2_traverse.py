@@ -127,11 +127,10 @@ def _slowed(agent: Any, arguments: Command) -> Any:
     """Returns a trained agent whose commands end at the speed that is asked for, in its own memory too."""
     if arguments.speed is None:
         return agent
-    if not isinstance(agent, Trained):
+    if Trained not in type(agent).__mro__:
         raise BenchmarkError(f"speed = {arguments.speed:g} is for a trained driver, and {arguments.agent} is none")
-    if hasattr(agent, "speed"):
-        return dataclasses.replace(agent, speed=arguments.speed)
-    return dataclasses.replace(agent, high=agent.high.at[0].min(arguments.speed))
+    own = {"speed": arguments.speed} if hasattr(agent, "speed") else {"high": agent.high.at[0].min(arguments.speed)}
+    return dataclasses.replace(agent, **own)
 
 
 def _drive_all(arguments: Command) -> tuple[transfer.Walk, transfer.Row, Any]:
@@ -188,7 +187,8 @@ def records_of(arguments: Command, figures: dict[str, float]) -> list[Record]:
         records.append(
             measured(
                 f"{name}/{(stem if unit in ('percent', 'deg') else figure).replace('_', '-')}",
-                float(f"{value:.3g}"), _UNITS.get(unit, ""), f"benchmarks.b2_traverse {words}",
+                round(value, 1) if unit in ("percent", "deg") else float(f"{value:.3g}"),
+                _UNITS.get(unit, ""), f"benchmarks.b2_traverse {words}",
                 interval=interval, tolerance=100.0 * 1.96 * math.sqrt(0.25 / n) if stem in end else 0.1 * abs(value),
                 **further,
             )
@@ -201,7 +201,7 @@ def wilson(rate: float, n: int) -> tuple[float, float]:
     z = 1.96
     middle, half = rate + z * z / (2 * n), z * math.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n))
     low, high = (100.0 * (middle + sign * half) / (1 + z * z / n) for sign in (-1, 1))
-    return round(low, 1), round(high, 1)
+    return max(round(low, 1), 0.0), min(round(high, 1), 100.0)
 
 
 def main(words: list[str] | None = None) -> int:

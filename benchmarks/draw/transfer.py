@@ -47,7 +47,7 @@ def run(config: TransferConfig) -> None:
         panel.grid(axis="x", alpha=0.3)
     axes[0].set_yticks(range(len(drives)), [f"{task}\n{agent}" for task, agent in drives], fontsize=8)
     axes[0].invert_yaxis()
-    axes[0].legend(fontsize=8, loc="lower right")
+    figure.legend(*axes[0].get_legend_handles_labels(), fontsize=8, loc="outside lower center", ncols=len(_ROBOTS))
     write_file(config.out, png_bytes(figure, dpi=80))
 
 
