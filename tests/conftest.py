@@ -1,4 +1,4 @@
-"""Compiles programs cheaply while the tests run, and once for all workers of a run.
+"""Compiles programs cheaply while the tests run, and once for all workers of a run and for the runs after it.
 
 Most of what the simulator's tests take is XLA compiling programs that run for a moment. Without LLVM's optimisations
 and fusion emitters it compiles five times as fast, and what comes out runs a third as fast. Where `XLA_FLAGS` is set,
@@ -9,23 +9,26 @@ import ctypes
 import gc
 import os
 import platform
-import shutil
 import sys
-import tempfile
 import threading
+import time
 from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
 
-_CACHE_NAME = "subterra-compiled-"
+_WEEK = 7 * 86_400.0  # s
 
 
-def _remove_forgotten() -> None:
-    """Removes the compiled programs of runs that were killed: their process is gone."""
-    for folder in Path(tempfile.gettempdir()).glob(f"{_CACHE_NAME}*-*"):
-        owner = folder.name.removeprefix(_CACHE_NAME).partition("-")[0]
-        if owner.isdecimal() and not Path("/proc", owner).exists() and Path("/proc/self").exists():
-            shutil.rmtree(folder, ignore_errors=True)
+def _kept_programs() -> Path:
+    """Returns the folder in which programs outlast a run of this machine, freed of those that none has used lately."""
+    caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    folder = caches / "subterra-tests" / f"{platform.node()}-jax-{version('jax')}"
+    folder.mkdir(parents=True, exist_ok=True)
+    for used in folder.glob("*-atime"):
+        if time.time() - used.stat().st_mtime > _WEEK:
+            used.with_name(used.name.removesuffix("-atime") + "-cache").unlink(missing_ok=True)
+            used.unlink(missing_ok=True)
+    return folder
 
 
 # Before jax is imported: XLA reads its flags once, and what a test starts inherits them.
@@ -33,10 +36,8 @@ def _remove_forgotten() -> None:
 _CHEAP = "--xla_llvm_disable_expensive_passes=true --xla_cpu_parallel_codegen_split_count=2 "  # a sixth less
 _LEAVE_OUT = f"{_CHEAP}--xla_cpu_use_fusion_emitters=false " if version("jax").startswith("0.10.") else ""
 os.environ.setdefault("XLA_FLAGS", f"{_LEAVE_OUT}--xla_backend_optimization_level=0")
-_OWN_CACHE = None
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # the first process of a run; its workers find it set
-    _remove_forgotten()
-    _OWN_CACHE = os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix=f"{_CACHE_NAME}{os.getpid()}-")
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = str(_kept_programs())
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 
 import jax  # noqa: E402
@@ -74,12 +75,6 @@ def pytest_collection_finish() -> None:
     gc.collect()
     gc.freeze()
     gc.set_threshold(50_000, 20, 50)
-
-
-def pytest_unconfigure() -> None:
-    """Leaves no compiled programs behind."""
-    if _OWN_CACHE is not None:
-        shutil.rmtree(_OWN_CACHE, ignore_errors=True)
 
 
 SLOW = Path(__file__).with_name("slow.txt")
