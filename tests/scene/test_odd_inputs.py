@@ -1,6 +1,8 @@
 """Well-formed and unusual files: what is no return is left out and counted, splits are read, packed ones named."""
 
 import gzip
+import subprocess
+import sys
 import xml.etree.ElementTree as ET
 
 import laspy
@@ -13,6 +15,7 @@ from mujoco import MjModel
 from scene.build import blame_poses
 from scene.errors import Code, RecordingError
 from scene.judging.judge import Warned
+from scene.limits import list_limits
 from scene.reading.cloudfile import read_cloud
 from scene.reading.formats import ReadingConfig, detect
 from scene.reading.recording import Recording
@@ -204,3 +207,17 @@ def test_nothing_in_the_bore_is_named_where_the_poses_scatter_the_returns():
     ]
     texts = [one.text for one in blame_poses(said)]
     assert texts == ["7% lie further than 10 cm; the poses, or their clock, scatter them", "a guess"]
+
+
+def test_every_threshold_has_words():
+    found = list(list_limits())
+    assert len(found) > 300
+    assert [(limit.part, limit.name) for limit in found if not limit.words] == []
+    assert len({one.part.split(".")[0] for one in found}) == 6  # packages
+
+
+def test_the_command_prints_those_that_are_asked_for():
+    command = [sys.executable, "-m", "scene.limits", "fitting.floor"]
+    shown = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
+    assert all(line.startswith("fitting.floor ") for line in shown)
+    assert any("_LOWER = 0.05  # m" in line for line in shown)

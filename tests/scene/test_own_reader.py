@@ -1,7 +1,7 @@
 """A format that the package does not know, read by a module of the user's own."""
 
 import json
-import shutil
+import re
 import subprocess
 import sys
 import zipfile
@@ -21,7 +21,7 @@ from tests.scene.bags import write_tum
 from tests.scene.clouds import curved_d_bore
 
 ROOT = Path(__file__).parents[2]
-READER = Path(__file__).with_name("plyzip.py")
+PAGE = ROOT / "docs" / "guide" / "extend.md"
 START = 1317376510.25
 
 
@@ -29,8 +29,16 @@ START = 1317376510.25
 def table(monkeypatch: pytest.MonkeyPatch) -> None:
     """The table of formats as it was, whatever a test adds."""
     monkeypatch.setattr(formats, "_own", {})
-    for name in [name for name in sys.modules if name.startswith(f"{READER.stem}_")]:
+    for name in [name for name in sys.modules if name.startswith("zip_reader_")]:
         monkeypatch.delitem(sys.modules, name)
+
+
+@pytest.fixture
+def reader(tmp_path: Path) -> Path:
+    """The reader of the page about extensions, as its reader saves it."""
+    file = tmp_path / "zip_reader.py"
+    file.write_text(re.search(r"`zip_reader\.py`:\n\n```python\n(.*?)```", PAGE.read_text(), re.DOTALL)[1])
+    return file
 
 
 def write_zip(path: Path, scans: list[np.ndarray]) -> Path:
@@ -45,9 +53,9 @@ def scans_of(count: int) -> list[np.ndarray]:
     return [rng.uniform(1, 9, (30, 3)).astype(np.float32) for _ in range(count)]
 
 
-def test_a_zip_of_ply_scans_is_read_by_a_file_outside_the_package(tmp_path):
+def test_a_zip_of_ply_scans_is_read_by_a_file_outside_the_package(reader, tmp_path):
     points = scans_of(3)
-    load_module(str(shutil.copy(READER, tmp_path)))
+    load_module(str(reader))
     with Recording(write_zip(tmp_path / "walk.zip", points)) as recording:
         scans = list(recording.scans())
         facts = recording.peek()
@@ -60,11 +68,11 @@ def test_a_zip_of_ply_scans_is_read_by_a_file_outside_the_package(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_scene_is_built_from_it_by_one_option(tmp_path):
+def test_a_scene_is_built_from_it_by_one_option(reader, tmp_path):
     bore = curved_d_bore(length=30.0, per_metre=4000, offset=(0.0, 0.0, 0.0))
     walk = write_zip(tmp_path / "walk.zip", np.array_split(bore.points.astype(np.float32), 10))
     poses = np.column_stack([START + np.array([-1.0, 2.0]), np.zeros((2, 6)), np.ones(2)])
-    words = [walk, "--reader", READER, "--trajectory", write_tum(tmp_path / "poses.tum", poses)]
+    words = [walk, "--reader", reader, "--trajectory", write_tum(tmp_path / "poses.tum", poses)]
     command = [sys.executable, "-m", "scene.build", *map(str, words), "--out", str(tmp_path / "out")]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -74,8 +82,8 @@ def test_a_scene_is_built_from_it_by_one_option(tmp_path):
     assert manifest["bore"]["length"] == pytest.approx(30.0, abs=0.3)
 
 
-def test_a_damaged_scan_is_named(tmp_path):
-    load_module(str(READER))
+def test_a_damaged_scan_is_named(reader, tmp_path):
+    load_module(str(reader))
     path = tmp_path / "walk.zip"
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("1.0.ply", "ply\nnonsense\n")

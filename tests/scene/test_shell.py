@@ -12,7 +12,7 @@ from scene.bore import NAIL
 from scene.writing.folder import write_geometry
 from scene.writing.mesh import build_solid
 from scene.writing.mjcf import SceneConfig
-from scene.writing.planar import cut_walls, half_widths, ring_pitch, save_tunnel
+from scene.writing.planar import cut_walls, half_widths, ring_pitch
 from scene.writing.track import TrackConfig, lay_track
 from subterra_jax.host.errors import TunnelError
 from subterra_jax.lidar3d import rolled, surface
@@ -55,24 +55,6 @@ def test_a_survey_of_every_fifth_ring_takes_the_pitch_of_the_joints_that_nails_b
     nail["station"] = np.repeat(np.arange(1.5, 18.0, 1.5), 3)[:24] + np.tile([-0.01, 0.0, 0.01], 8)
     surveyed = replace(bore, ring_station=np.arange(0.0, 24.0, 7.0), nail=nail)
     assert ring_pitch(surveyed) == pytest.approx(1.5)
-
-
-def test_the_tunnel_file_holds_every_field_of_the_format(bore, walls, tmp_path):
-    laid = lay_track(bore, TrackConfig())
-    save_tunnel(
-        tmp_path / "t.npz", "x", "simulated", bore, laid.elevation, 0.7, {**walls, "furnished": walls["pockets"]}
-    )
-    with np.load(tmp_path / "t.npz") as data:
-        assert str(data["schema"]) == "subterra.tunnel/3"
-        assert list(data["lining"]) == ["smooth", "pockets", "furnished"]
-        n = len(data["station"])
-        assert data["centre"].shape == data["tangent"].shape == (n, 2)
-        assert data["elevation"].shape == data["half_width"].shape == (n,)
-        assert data["ring_pitch"].shape == ()
-        for variant in data["lining"]:
-            for side in ("left", "right"):
-                assert data[f"{side}_{variant}"].shape == (*data[f"{side}_station_{variant}"].shape, 2)
-            assert data[f"furniture_{variant}"].shape[1] == 4
 
 
 LININGS = ("smooth", "pockets", "furnished")

@@ -19,7 +19,6 @@ from scene.survey.furniture import DESIGN, TOLERANCE, draw_sizes
 from scene.survey.lidar import AVIA_POINT_RATE, Lidar, avia, avia_directions, os1, vlp16
 from scene.survey.mesh import Mesh, Part
 from scene.survey.section import draw_field
-from scene.survey.write import describe_truth
 
 
 def rosette(begin: float, duration: float) -> np.ndarray:
@@ -183,23 +182,6 @@ def test_without_tolerances_a_bore_is_as_designed_and_all_other_draws_stay(bores
     np.testing.assert_array_equal(designed.filled[:12], built.filled[:12])
     station = np.arange(0.0, 20.0)
     np.testing.assert_array_equal(bores[0].section.width(station), bores[1].section.width(station))
-
-
-def test_the_surface_has_the_sizes_that_the_truth_states(bores, tmp_path) -> None:
-    bore = bores[1]
-    truth, mesh = describe_truth(bore, SurveyConfig(tmp_path, tolerances=True)), bore.mesh()
-    points = mesh.vertices[np.unique(mesh.faces[mesh.part == Part.RAIL])]
-    frame = bore.alignment.frames(np.array([10.0]))
-    near = points[abs((points - frame.position[0]) @ frame.tangent[0]) < 0.2] - frame.position[0]
-    left, up = near @ frame.lateral[0], near @ frame.up[0]
-    faces = left[(up > up.max() - 0.02) & (up < up.max() - 0.011)] - truth["tracks"][0]
-    gap = faces[faces > 0].min() - faces[faces < 0].max()
-    assert gap == pytest.approx(truth["rails"]["gauge"], abs=2e-3)
-    assert np.ptp(up) == pytest.approx(truth["rails"]["height"], abs=2e-3)
-    assert truth["rails"]["gauge"] == bore.furniture.sizes.gauge != DESIGN.gauge
-    assert np.median(np.diff(truth["rings"]["station"])) == pytest.approx(bore.furniture.sizes.ring_width, abs=1e-6)
-    depth = {side: np.mean([p["depth"] for p in truth["pockets"] if p["side"] == side]) for side in ("left", "right")}
-    assert depth["left"] != pytest.approx(depth["right"], abs=1e-4)
 
 
 class Sending(ExitStack):

@@ -103,19 +103,6 @@ def test_sections_that_fold_into_each_other_are_an_error_with_their_place():
     assert raised.value.code is Refusal.FOLDED
 
 
-def test_a_ray_into_a_pocket_goes_13_cm_further(bore):
-    solid = as_trimesh(build_solid(bore, pockets=True))
-    pocket = bore.pocket[0]
-    at = bore.axis.at(np.array([pocket["station"]]))
-    height = np.sin(pocket["angle"]) * np.interp(pocket["angle"], bore.angle, bore.radius[0])
-    origin = at.position[0] + height * at.up[0]
-    inside, beside = (
-        np.linalg.norm(solid.ray.intersects_location([start], [at.lateral[0]])[0][0] - start)
-        for start in (origin, origin - 0.4 * at.tangent[0])
-    )
-    assert inside - beside == pytest.approx(0.13, abs=0.015)
-
-
 def test_chunks_hold_every_face_once(case):
     bore, _, lining = case
     parts = split_lining(lining, bore, 5.0)

@@ -1,6 +1,5 @@
 """Batches that reset themselves: fresh draws, exact final observations, no influence of the batch's size."""
 
-import dataclasses
 from functools import partial
 
 import jax
@@ -93,27 +92,6 @@ def test_each_episode_of_one_environment_has_its_own_bias_and_start():
         assert len(np.unique(values)) == values.size
     starts = np.stack([np.asarray(state.lateral) for state in states])
     assert len(np.unique(starts)) == starts.size
-
-
-def test_params_may_differ_from_environment_to_environment():
-    shared, params = batch_of()
-    axes = jax.tree.map(lambda _: None, params)
-    axes = axes.replace(horizon=0, vehicle=dataclasses.replace(axes.vehicle, speed_max=0))
-    speeds = jnp.linspace(0.5, 2.0, 8)
-    mixed = params.replace(
-        horizon=jnp.maximum(jnp.arange(8, dtype=jnp.int32), 1),
-        vehicle=dataclasses.replace(params.vehicle, speed_max=speeds),
-    )
-    batch = st.AutoReset(shared.env, params_axes=axes)
-    _, state = reset_jit(batch, jax.random.key(0), mixed, 8)
-    _, state, _, _, truncated, info = step_jit(
-        batch, jax.random.key(1), state, jnp.full((8, 2), jnp.array([9.0, 0.0])), mixed
-    )
-    assert np.asarray(truncated).tolist() == [True] * 2 + [False] * 6
-    # Two end, one more than the step looks at alone: each has its own last observation.
-    assert (np.asarray(info["final_observation"])[:, 16] != 0.0).all()
-    np.testing.assert_allclose(np.asarray(info["station"]), 0.1 * np.asarray(speeds), rtol=0.02)
-    np.testing.assert_allclose(np.asarray(state.command)[2:, 0], np.asarray(speeds)[2:])
 
 
 def test_params_of_every_environment_may_be_stacked_whole():

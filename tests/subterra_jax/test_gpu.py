@@ -13,7 +13,7 @@ from benchmarks import reference
 from subterra_jax import lidar
 from subterra_jax.lidar import gpu, kernels
 from subterra_jax.parts import unicycle
-from subterra_jax.tunnel import CONTACT_REACH, Tunnel, node_at, packed
+from subterra_jax.tunnel import CONTACT_REACH, Tunnel, node_at
 from tests.subterra_jax.lowering import for_nvidia
 from tests.subterra_jax.modes import wide
 
@@ -103,38 +103,6 @@ def test_a_tunnel_whose_walls_were_replaced_is_cast_by_xla(
     scan = jax.vmap(lambda tunnel, *row: lidar.scan(tunnel, *row, lidar.LidarParams()), (None, 0, 0, 0))
     assert "triton" in for_nvidia(scan, tunnel, *rows)
     assert "triton" not in for_nvidia(scan, dataclasses.replace(tunnel, packed=None), *rows)
-
-
-def unpacked(tunnel: Tunnel) -> list[np.ndarray]:
-    return [np.asarray(part) for part in packed.unpack(tuple(jnp.asarray(tunnel.packed.block).T))]
-
-
-@pytest.mark.parametrize("name", [None, NAMES[4], NAMES[6]])
-def test_a_packed_block_holds_the_box_its_plane_and_its_vertices(name: str | None) -> None:
-    tunnel = Tunnel.from_plan(piece_of(name))
-    there = np.asarray(tunnel.box)[4] > 0.0
-    x, y, e_x, e_y, thickness, pairs, n_x, n_y, ahead, behind = unpacked(tunnel)
-    np.testing.assert_array_equal(np.stack([x, y]), np.asarray(tunnel.box)[:2])
-    np.testing.assert_array_equal(np.stack([n_x, n_y]), np.asarray(tunnel.box)[6:8])
-    assert np.all(thickness[~there] == -1.0)
-    assert np.all(np.isinf(np.stack([ahead, behind])[:, ~there]))
-    box = np.asarray(tunnel.box, np.float64)[:, there]
-    for plane, exact in ((ahead, box[8]), (behind, box[9])):
-        assert np.all(plane[there] <= exact)
-        assert np.all(plane[there] >= exact - 0.01 * np.abs(exact) - 1e-6)
-    e_x, e_y, grown = e_x[there].astype(float), e_y[there].astype(float), thickness[there].astype(float)
-    length = np.hypot(e_x, e_y)
-    for side in (-1.0, 1.0):
-        corner_x, corner_y = box[2] - side * box[4] * box[3] / box[5], box[3] + side * box[4] * box[2] / box[5]
-        assert np.all(np.abs(corner_y * e_x - corner_x * e_y) <= grown * length)
-        assert np.all(np.abs(corner_x * e_x + corner_y * e_y) <= (length + grown) * length)
-    assert (grown - box[4]).max() < 0.02
-    first = np.asarray(tunnel.packed.block)[:, 6]
-    for i in np.flatnonzero(there)[::17]:
-        own = np.asarray(tunnel.packed.wall)[first[i] : first[i] + pairs[i]].reshape(-1, 2)
-        wall = np.asarray(tunnel.wall)[i].T
-        np.testing.assert_array_equal(own[: len(wall)], wall[: len(own)])
-        assert np.all(wall[len(own) :] == wall[-1])
 
 
 def places(plan: st.TunnelPlan, lining: str, seed: int) -> tuple[np.ndarray, np.ndarray]:

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from subterra_jax.baselines.agent import observed
 from subterra_jax.rules import Choice
 
 N = 2000
@@ -31,16 +30,6 @@ def test_a_hidden_start_is_off_by_three_metres_and_a_known_one_by_nothing():
     assert off.std() == pytest.approx(2.97, rel=0.06)  # cut off at three standard deviations
     assert abs(off.mean()) < 0.25
     assert np.abs(off).max() <= 9.001
-
-
-def test_the_believed_start_is_observed_and_the_true_one_is_not():
-    env, params = st.make("Subterra/Return-v1", tunnel="control", hidden_start=True)
-    flat, state = env.reset(jax.random.key(0), params)
-    obs = observed(env, params, flat)
-    assert float(obs.start) == float(state.goal.told)
-    assert float(obs.flag) == 0.0
-    far = np.abs(np.asarray(flat) - float(state.station)).min()
-    assert far > 0.1, "a number of the observation is the true station"
 
 
 def test_the_way_back_ends_at_the_station_that_was_told():

@@ -93,19 +93,6 @@ def test_furniture_is_seen(plan_of):
     check_exact(plan_of(arrays), "smooth", 2000)
 
 
-def test_furniture_along_a_wall_is_exact(plan_of):
-    """Brackets a metre apart, whose boxes a beam along the wall grazes by the dozen."""
-    arrays = tunnels.tunnel_arrays(tunnels.s_bend(150.0, 150.0), roughness=0.015)
-    centre, tangent = arrays["centre"][8:-8:4], arrays["tangent"][8:-8:4]
-    normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
-    corners = [
-        centre + x * tangent - (2.75 - y) * normal for x, y in ((-0.03, 0), (0.03, 0), (0.03, 0.05), (-0.03, 0.05))
-    ]
-    outline = np.stack(corners, axis=1)
-    arrays["furniture_pockets"] = np.concatenate([outline, np.roll(outline, -1, axis=1)], axis=2).reshape(-1, 4)
-    check_exact(plan_of(arrays), "pockets", 20_000)
-
-
 @pytest.mark.parametrize("n_candidates", [1, 3])
 @pytest.mark.parametrize("fused", [True, False])
 def test_a_beam_along_a_row_of_deep_recesses_is_exact(fused, n_candidates):

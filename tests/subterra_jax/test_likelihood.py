@@ -155,28 +155,6 @@ def reference_fit(walls, ends, i: int, model: ScanModel) -> tuple[float, float, 
     return model.power * (each[useful].sum() - 0.5 * drawn), shift, turn
 
 
-def test_the_true_station_fits_best_among_its_neighbours_in_most_scans(tunnel):
-    walls = wall_map(tunnel).pick(tunnel)
-    offsets = np.linspace(-0.7, 0.7, 29)
-
-    @jax.jit
-    @jax.vmap
-    def scores(station, noise):
-        ranges = lidar.add_noise(true_scan(tunnel, station, 0.1, 0.02), noise, BEAMS)
-        n = jnp.ones(len(offsets))
-        return fit(
-            walls, TunnelPose(station + jnp.asarray(offsets, jnp.float32), 0.1 * n, 0.02 * n), ranges, FAR, ScanModel()
-        )[0]
-
-    rng = np.random.default_rng(2)
-    station = jnp.asarray(rng.uniform(15.0, 75.0, 200), jnp.float32)
-    found = np.asarray(scores(station, jnp.asarray(rng.normal(size=(200, 16)), jnp.float32)))
-    # Scans add up: over some metres the truth is 10 standard errors ahead of a place half a pocket away.
-    assert np.all(np.argmax(found.mean(axis=0)) == len(offsets) // 2)
-    error = np.abs(offsets[np.argmax(found, axis=1)])
-    assert np.mean(error <= 0.1) > 0.6
-
-
 def test_a_first_look_finds_offset_and_heading(tunnel):
     walls = wall_map(tunnel).pick(tunnel)
     for lateral, heading in ((0.5, 0.1), (-0.5, 0.1), (0.45, -0.1), (-0.3, -0.05)):

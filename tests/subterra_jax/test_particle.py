@@ -82,19 +82,6 @@ def test_the_odometer_weighs_as_much_as_its_nominal_errors_allow():
     assert reckoning.odometer_share(params) == pytest.approx(8.0 / 13.0, rel=1e-5)
 
 
-def test_without_errors_a_cloud_follows_the_bend(plan_of):
-    bend = st.Tunnel.from_plan(plan_of(tunnels.tunnel_arrays(tunnels.arc(80.0, 100.0), half_width=3.0)), "smooth")
-    walls, cloud = wall_map(bend).pick(bend), cloud_at([20.0, 25.0])
-
-    def drive(cloud, _):
-        return move(jax.random.key(1), cloud, walls, jnp.float32(0.2), jnp.float32(0.002), EXACT), None
-
-    after = jax.lax.scan(drive, cloud, None, length=100)[0].pose
-    np.testing.assert_allclose(after.station, [40.0, 45.0], atol=0.01)
-    np.testing.assert_allclose(after.lateral, 0.0, atol=0.02)
-    np.testing.assert_allclose(after.heading, 0.0, atol=0.005)
-
-
 def test_a_cloud_that_faces_back_drives_to_smaller_stations(plan_of):
     straight = st.Tunnel.from_plan(plan_of(tunnels.tunnel_arrays(tunnels.straight(80.0))), "smooth")
     cloud = cloud_at([40.0], heading=np.pi)

@@ -1,12 +1,21 @@
-"""Cells list every triangle that comes near them."""
+"""Rough walls as triangles: every cell lists what goes through it, and rolled and wide beams meet what is there."""
 
+import dataclasses
+
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+import subterra_jax as st
+from benchmarks import reference
+from subterra_jax import lidar, lidar3d
 from subterra_jax.host.errors import TunnelError
-from subterra_jax.lidar3d import cells, relief, surface
+from subterra_jax.lidar3d import beams, cells, relief, rolled, surface
 from subterra_jax.lidar3d.relief import Relief
 from subterra_jax.lidar3d.surface import split_boxes
+from subterra_jax.procedural import open_world
 from tests.subterra_jax import surfaces
 
 
@@ -90,3 +99,93 @@ def test_a_surface_away_from_the_axis_is_refused():
     far = surfaces.box((500.0, 0.0, 0.0), (1.0, 1.0, 1.0))
     with pytest.raises(ValueError, match="no triangle lies along the axis"):
         Relief.from_triangles(surface.Axis(**axis), surface.Triangles(*far))
+
+
+def as_set(faces: np.ndarray) -> set[tuple[int, ...]]:
+    return {tuple(sorted(face)) for face in faces.tolist()}
+
+
+@pytest.mark.parametrize("name", ["open:cast:train:73", "open:masonry:train:60", "open:rock:test-unseen:49"])
+@pytest.mark.parametrize("window", [None, (9.3, 17.0)])
+def test_every_triangle_is_delaunays_and_looks_inwards(name, window, monkeypatch):
+    shell = open_world.plan(name, variants=("built",), length=30.0).shell
+    found = []
+
+    def searched(u, s, node, shape, girth, length, real=rolled._faces):
+        faces = real(u, s, node, shape, girth, length)
+        found.append((faces, rolled._delaunay(u, s, girth), u, s, girth))
+        return faces
+
+    monkeypatch.setattr(rolled, "_faces", searched)
+    rolled.raise_shell(shell if window is None else shell.cut(*window), "built")
+    ((faces, expected, u, s, girth),) = found
+    assert len(faces) == len(expected) > 3000
+    assert as_set(faces) == as_set(expected)
+    across, along = ((values[faces] - values[faces[:, :1]])[:, 1:] for values in (u, s))
+    across = (across + girth / 2) % girth - girth / 2
+    assert (across[:, 0] * along[:, 1] - across[:, 1] * along[:, 0] > 0.0).all()
+
+
+N = 64
+
+
+@pytest.fixture(scope="module")
+def family() -> tuple[list[st.TunnelPlan], lidar3d.Relief]:
+    plans = [st.load_tunnel(f"open:val:{i}").slice(20.0, 90.0) for i in range(4)]
+    plans = [dataclasses.replace(plan, elevation=0.0 * plan.elevation) for plan in plans]
+    return plans, lidar3d.stack_reliefs([lidar3d.Relief.from_plan(plan) for plan in plans])
+
+
+def scans(relief: lidar3d.Relief, which: np.ndarray, poses: reference.Poses, height: float, beam: np.ndarray):
+    ways = np.float32([Rotation.from_euler("z", heading).apply(beam) for heading in poses.heading])
+    place = np.column_stack([poses.position, np.full(len(ways), height)]).astype(np.float32)
+    one = lambda k, *rest: surfaces.ranges(relief.pick(k), *rest)  # noqa: E731
+    return np.asarray(jax.jit(jax.vmap(one))(which, place, ways, poses.station))
+
+
+def test_beams_up_and_down_meet_crown_and_floor(family) -> None:
+    plans, relief = family
+    poses = reference.random_poses(plans[1], N, np.random.default_rng(9))
+    beam = np.float32([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
+    ranges = scans(relief, np.ones(N, int), poses, 0.7, beam)
+    np.testing.assert_allclose(ranges, np.tile([5.3, 0.7], (N, 1)), atol=1e-4)
+
+
+def test_a_packaged_tunnel_is_raised_along_its_grade_and_a_lidar_above_the_crown_is_refused() -> None:
+    plan = dataclasses.replace(st.load_tunnel().slice(100.0, 40.0), shell=None)
+    relief = lidar3d.Relief.from_plan(plan)
+    assert sum(leaf.nbytes for leaf in jax.tree.leaves(relief)) < 2e6
+    mid = len(plan.station) // 2
+    place = jnp.asarray([*plan.centre[mid], plan.elevation[mid] + 1.0], jnp.float32)
+    down = surfaces.ranges(relief, place, jnp.array([[0.0, 0.0, -1.0]]), jnp.float32(plan.station[mid]))
+    np.testing.assert_allclose(down, [1.0], atol=1e-3)
+    with pytest.raises(st.SubterraError, match=r"below the assumed crown at 6 m, is at 6.5 m"):
+        lidar3d.Relief.from_plan(dataclasses.replace(plan, lidar_height=6.5))
+
+
+@pytest.mark.parametrize(
+    ("pattern", "count"),
+    [(beams.planar(16), 16), (beams.spinning(np.linspace(-0.3, 0.3, 16), 1800), 28_800), (beams.rosette(), 24_000)],
+)
+def test_beams_are_unit_vectors_and_as_many_as_the_sensor_has(pattern, count):
+    assert pattern.shape == (count, 3)
+    np.testing.assert_allclose(np.linalg.norm(pattern, axis=1), 1.0, atol=1e-6)
+
+
+def test_the_planar_pattern_is_that_of_the_planar_lidar():
+    level = np.asarray(lidar.beam_directions(jnp.float32(0.0), 16))
+    np.testing.assert_allclose(beams.planar(16), np.column_stack([level, np.zeros(16)]), atol=1e-6)
+
+
+def test_a_rosette_stays_in_its_field_of_view_and_does_not_repeat():
+    first, second = beams.rosette(), beams.rosette(start=0.1)
+    azimuth, elevation = np.arctan2(first[:, 1], first[:, 0]), np.arcsin(first[:, 2])
+    assert np.abs(azimuth).max() == pytest.approx(np.deg2rad(35.2), rel=0.01)
+    assert np.abs(elevation).max() == pytest.approx(np.deg2rad(38.6), rel=0.01)
+    assert np.abs(first - second).max() > 0.1
+
+
+@pytest.mark.parametrize("make", [lambda: beams.planar(0), lambda: beams.spinning(np.array([1.6]), 4)])
+def test_an_impossible_pattern_is_refused(make):
+    with pytest.raises(ValueError, match="must"):
+        make()

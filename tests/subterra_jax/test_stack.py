@@ -75,19 +75,6 @@ def assert_same(one, other) -> None:
         np.testing.assert_array_equal(a, b)
 
 
-def test_a_batch_may_mix_the_tunnels_of_a_stack(plans, alone, together):
-    several = poses_in(plans, 400)
-    n = len(several[0].station)
-    mixed = [
-        np.stack(part, axis=1).reshape(n * len(plans), *part[0].shape[1:])
-        for part in zip(*(vars(poses).values() for poses in several), strict=True)
-    ]
-    seen = look(together, jnp.tile(jnp.arange(len(plans)), n), *mixed)
-    for i, (tunnel, poses) in enumerate(zip(alone, several, strict=True)):
-        own = look(tunnel, jnp.zeros(n, jnp.int32), *vars(poses).values())
-        assert_same(own, jax.tree.map(lambda leaf, i=i: leaf[i :: len(plans)], seen))
-
-
 def test_each_tunnel_of_a_stack_agrees_with_its_own_walls(plans, together):
     for i, (plan, lining, poses) in enumerate(zip(plans, LININGS, poses_in(plans, 400), strict=True)):
         ranges = look(together, jnp.full(len(poses.station), i), *vars(poses).values())[0]

@@ -173,6 +173,7 @@ def test_scan_matching_finds_the_shift_by_brightness_alone():
     env, params = st.make(TASK, tunnel=straight(), intensity=True, texture=1.0)
     zero, settings = jnp.zeros(()), scanmatch.MatchParams()
 
+    @jax.jit
     def sensing(x, key):
         state = placed(env, params, x)
         flat = env.observe(state, env.draw_step(jax.random.key(key), (), params), params)

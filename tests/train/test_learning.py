@@ -1,6 +1,7 @@
-"""PPO learns to stop at a goal, and what would break it is noticed: by the run, or by what a step of it does."""
+"""PPO learns to drive and to stop, and what would break it is noticed: by the run, or by what a step of it does."""
 
 import dataclasses
+import json
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,7 @@ from tests.subterra_jax.tunnels import write_corridor
 from train.config import TrainConfig
 from train.driver import Driver, Policy
 from train.evaluate import evaluate
+from train.log import read_log
 from train.policies import make_agent
 from train.ppo import train
 from train.rollout import begin, collect
@@ -75,3 +77,28 @@ def test_robots_whose_truth_alone_differs_read_and_do_the_same_and_are_asked_for
     np.testing.assert_allclose(driver.log_prob(out, one.raw), one.log_prob, atol=1e-5)
     assert one.error.shape == (1, 2, 1)
     assert jnp.abs(one.error).max() < 1.0  # at the start nothing is off but the odometer
+
+
+def test_ppo_learns_to_drive_through_a_corridor(trained):
+    last = read_log(trained)[-1]
+    assert last["coverage_mean_100"] >= 0.9
+    assert last["success_mean_100"] == 1.0
+    assert last["timing"]["seconds"] < 60.0
+
+
+def test_training_stops_once_the_goal_has_held_for_long_enough(trained):
+    log, config = read_log(trained), json.loads((trained / "config.json").read_text())["config"]
+    assert log[-1]["step"] < config["steps"]
+    held = [line["coverage_mean_100"] >= 0.9 and line["success_mean_100"] == 1.0 for line in log]
+    assert all(held[-config["stop_patience"] :])
+
+
+def test_the_rolling_means_of_the_log_are_those_of_the_episodes_file(trained):
+    rows = np.genfromtxt(trained / "episodes.csv", delimiter=",", names=True)
+    for line in read_log(trained):
+        so_far = rows[: line["episodes"]][-100:]
+        if len(so_far):
+            assert line["coverage_mean_100"] == pytest.approx(so_far["coverage"].mean(), abs=1e-7)
+            assert line["success_mean_100"] == so_far["success"].mean()
+    assert (np.diff(rows["step"]) >= 0).all()
+    np.testing.assert_array_equal(rows["episode"], np.arange(1, len(rows) + 1))

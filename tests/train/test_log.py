@@ -92,26 +92,6 @@ def runs(folder, coverages, task="Subterra/Traverse-v1"):
     return sorted(folder.iterdir())
 
 
-def test_the_figure_of_several_seeds_is_coverage_and_success_against_episodes_with_a_band(tmp_path, monkeypatch):
-    from matplotlib import pyplot
-
-    shown = []
-    monkeypatch.setattr(pyplot, "close", shown.append)
-    curve.write_curve(runs(tmp_path, [[0.2] * 150, [0.4] * 130, [0.9] * 140]), tmp_path / "curve.png")
-    (figure,) = shown
-    coverage, success = figure.axes
-    assert [axes.get_xlabel() for axes in figure.axes] == ["finished episodes"] * 2
-    assert "coverage" in coverage.get_ylabel()
-    assert "success" in success.get_ylabel()
-    lines = {line.get_label(): line.get_ydata() for line in coverage.get_lines()}
-    np.testing.assert_allclose(lines["mean ± sd"], np.full(130, 50.0))
-    assert {"seed-0", "seed-1", "seed-2", "90 % goal"} <= set(lines)
-    (band,) = coverage.collections
-    low, high = np.ptp(band.get_paths()[0].vertices[:, 1]), np.std([20.0, 40.0, 90.0], ddof=1)
-    assert low == pytest.approx(2.0 * high)
-    np.testing.assert_allclose(success.get_lines()[2].get_ydata(), np.full(140, 100.0))
-
-
 def test_the_figure_of_a_task_with_a_goal_is_success_against_steps_and_seconds_with_lines(tmp_path, monkeypatch):
     from matplotlib import pyplot
 

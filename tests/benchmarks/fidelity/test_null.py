@@ -1,13 +1,18 @@
-"""The null tube and the truth as candidate: known volumes, known axes."""
+"""The truth as candidate, its bed, and changes that must not matter."""
 
 import numpy as np
 import pytest
 
 from benchmarks.fidelity import table
+from benchmarks.fidelity.candidate import load_candidate
 from benchmarks.fidelity.case import Case
+from benchmarks.fidelity.derive.surface import visible_mesh
+from benchmarks.fidelity.faults import Fault, Site, put_in
+from benchmarks.fidelity.faults.kinds import load_controls
 from benchmarks.fidelity.impostors import null_tube, truth_candidate
 from benchmarks.fidelity.registry import compute_metric
-from tests.benchmarks.fidelity import tube
+from tests.benchmarks.fidelity import tube, tubescene
+from tests.benchmarks.fidelity.tube import Tube
 
 
 @pytest.fixture(scope="module")
@@ -52,3 +57,66 @@ def test_the_truth_as_candidate_is_the_truth(case: Case) -> None:
     noise = compute_metric(judged(case, made), table.load()["c2m_mean"]).value
     assert noise is not None
     assert noise < 0.0125  # of this tube's own recording; the noise floor is that of another sensor
+
+
+SLAB = '<geom name="bed_000" type="box" size="2 1.5 0.1" pos="3 0 -2" contype="5" conaffinity="0" group="{group}"/>'
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return tubescene.write(tmp_path_factory.mktemp("bed") / "tube", Tube(length=6.0))
+
+
+def with_slab(scene, group: int):
+    path = scene / "scene.xml"
+    text = path.read_text()
+    path.write_text(text.replace("</worldbody>", SLAB.format(group=group) + "</worldbody>"))
+    try:
+        return load_candidate(scene)
+    finally:
+        path.write_text(text)
+
+
+def test_a_bed_that_the_scene_shows_is_seen(scene) -> None:
+    judged = with_slab(scene, 0)
+    np.testing.assert_allclose(judged.bed.bounds, [[1, -1.5, -2.1], [5, 1.5, -1.9]], atol=1e-6)
+    assert len(visible_mesh(judged).faces) == len(visible_mesh(load_candidate(scene)).faces) + 12
+    assert len(null_tube(judged).bed.faces) == 12
+    assert not len(null_tube(judged, sleepers=False).bed.faces)
+
+
+def test_a_bed_that_only_bodies_touch_is_not(scene) -> None:
+    assert not len(with_slab(scene, 3).bed.faces)
+
+
+def test_the_bed_moves_with_everything_else(scene) -> None:
+    judged = with_slab(scene, 0)
+    moved = put_in(Site(Case(judged)), Fault("elsewhere")).candidate
+    apart = [part.bed.centroid - part.lining.centroid for part in (judged, moved)]
+    assert np.linalg.norm(apart[0]) == pytest.approx(np.linalg.norm(apart[1]), abs=1e-6)
+    assert np.linalg.norm(moved.bed.centroid - judged.bed.centroid) > 1000.0
+
+
+WATCHED = ("c2m_mean", "beam_range_mae", "cl_lateral_rmse", "sec_width_rmse", "mesh_orientation_frac", "trk_sleeper_f1")
+
+
+@pytest.fixture(scope="module")
+def base() -> Case:
+    return tube.case(tube.Tube(bend=80.0))
+
+
+def scores(case: Case) -> dict[str, float | None]:
+    rows = table.load()
+    return {id: rows[id].map.score(compute_metric(case, rows[id]).value or 0.0) for id in WATCHED}
+
+
+INVARIANCES = {id: control for id, control in load_controls().items() if control.kind == "invariance"}
+
+
+def changed(base: Case, control: str) -> Case:
+    return put_in(Site(base), INVARIANCES[control].faults[0.0])
+
+
+@pytest.mark.parametrize("control", INVARIANCES)
+def test_an_invariance_is_quiet(base: Case, control: str) -> None:
+    assert scores(changed(base, control)) == pytest.approx(scores(base), abs=INVARIANCES[control].limit)

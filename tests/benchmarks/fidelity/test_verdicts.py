@@ -1,15 +1,18 @@
-"""Verdicts of controls and all written forms, on values that are made to be known."""
+"""Verdicts, the constants beneath them, and the ladder that finds how small a fault is seen."""
 
 import csv
 import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from benchmarks.fidelity import judge, scoring, table
 from benchmarks.fidelity.case import Case
+from benchmarks.fidelity.faults import runner as ladder
 from benchmarks.fidelity.faults.runner import Bench, Job, Outcome, judge_outcomes, run_control, run_jobs
+from benchmarks.fidelity.files import FidelityError
 from benchmarks.fidelity.inputs import Inputs
 from benchmarks.fidelity.judge import Judgement
 from benchmarks.fidelity.registry import Value, missing
@@ -195,3 +198,98 @@ def test_controls_are_kept_and_taken_up_again(tmp_path: Path) -> None:
     assert len(calls) == 2
     assert [o.values for o in again] == [o.values for o in first]
     assert run_control(bench, jobs[0]).job == jobs[0]
+
+
+# Whoever changes a threshold, weight, gate, limit or row on purpose writes the new digest here, with the reason.
+# Last: the sweep over thresholds left, and its limits with it; maps, gates and limits of the verdict are the same.
+DIGEST = "5272174c7c16f487b95544015de1cd7c6147995d6c2a69b41a14f110a62cabc3"
+
+
+def ideal(row: table.Metric) -> Value:
+    return Value(1.0 if row.map.kind == "P" else row.map.target if row.map.kind == "B" else row.map.good)
+
+
+def worst(row: table.Metric) -> Value:
+    return Value(0.0 if row.map.kind == "P" else row.map.target + row.map.bad)
+
+
+def test_the_frozen_constants_are_the_pinned_ones() -> None:
+    assert judge.constants_digest() == DIGEST
+
+
+def test_a_looser_threshold_and_a_changed_limit_of_the_verdict_change_the_digest(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rows = dict(table.load())
+    rows["c2m_mean"] = replace(rows["c2m_mean"], map=replace(rows["c2m_mean"].map, bad=1.0))
+    with monkeypatch.context() as patch:
+        patch.setattr(table, "load", lambda: rows)
+        assert judge.constants_digest() != DIGEST
+    monkeypatch.setattr(scoring, "PASS_GLOBAL", 80.0)
+    assert judge.constants_digest() != DIGEST
+
+
+@pytest.mark.parametrize("gate", [id for id, row in table.load().items() if row.role == "G"])
+def test_a_failed_gate_caps_its_category_and_fails_the_verdict(gate: str) -> None:
+    rows = table.load()
+    perfect = {id: ideal(row) for id, row in rows.items()}
+    category = rows[gate].category
+    assert scoring.score_all(perfect).categories[category] == 100.0
+    scored = scoring.score_all(perfect | {gate: worst(rows[gate])})
+    assert scored.categories[category] == 50.0
+    assert scored.failed_gates == (gate,)
+    reasons = scoring.reasons_against(scored, None, None, [], [], [])
+    assert any(reason.startswith(f"gate {gate} failed") for reason in reasons)
+    assert f"category {category} is 50.0, below 70" in reasons
+
+
+@pytest.mark.parametrize("name", table.CATEGORIES)
+def test_a_category_is_scored_while_at_most_thirty_per_cent_of_it_are_missing(name: str) -> None:
+    rows = table.load()
+    perfect, own = {id: ideal(row) for id, row in rows.items()}, [i for i, r in rows.items() if r.category == name]
+    scored = [id for id in own if rows[id].scored]
+    most = int(0.3 * len(scored) + 1e-9)
+    for count, score in ((most, 100.0), (most + 1, None)):
+        found = scoring.score_all(perfect | dict.fromkeys(scored[:count], missing("none")))
+        assert found.categories[name] == score
+
+
+@pytest.fixture(scope="module")
+def good() -> Case:
+    return tube.case(tube.Tube(length=24.0), beams=2000)
+
+
+def test_a_ladder_finds_the_limit_and_goes_on_where_it_was(good, tmp_path, monkeypatch) -> None:
+    rows = ladder.climb_ladders(good, ("gauge", "rails"), 1, 5, tmp_path)
+    for row in rows:
+        sizes = ladder.rungs(row["kind"])
+        by = {round(one["size"], 9): one["by"] for one in row["tried"]}
+        assert by[round(sizes[row["rung"]], 9)]  # noticed there
+        assert not by[round(sizes[row["rung"] - 1], 9)]  # and not below
+    # The limits are 2 mm for a change of gauge and 12 mm for height.
+    assert all(0.0015 < ladder.rungs("gauge")[row["rung"]] < 0.0035 for row in rows if row["kind"] == "gauge")
+    assert all(0.009 < ladder.rungs("rails")[row["rung"]] < 0.017 for row in rows if row["kind"] == "rails")
+    with monkeypatch.context() as patch:
+        patch.setattr(ladder, "noticed_by", lambda *_: pytest.fail("done already"))
+        again = ladder.climb_ladders(good, ("gauge", "rails"), 1, 5, tmp_path)
+    assert [(one["kind"], one["number"], one["rung"]) for one in again] == [
+        (one["kind"], one["number"], one["rung"]) for one in rows
+    ]
+    assert [one["noticed_at_asked"] for one in ladder.sum_up(rows)] == [1, 1]
+
+
+def test_the_sizes_that_half_and_95_percent_of_places_notice_are_known() -> None:
+    sizes = ladder.rungs("wall")
+    (one,) = ladder.sum_up([{"kind": "wall", "rung": rung} for rung in [3] * 10 + [5] * 9 + [9]])
+    assert (one["size_50"], one["size_95"], one["noticed_at_asked"]) == (sizes[5], sizes[9], 20)
+    (never,) = ladder.sum_up([{"kind": "wall", "rung": len(sizes)}] * 10)
+    assert (never["size_95"], never["noticed_at_asked"]) == (np.inf, 0)
+
+
+def test_a_ladder_that_cannot_be_climbed_is_refused(tmp_path) -> None:
+    for words, says in (((("box",), 1, 0), "no size of 'box'"), (((), 0, 0), "places"), (((), 1, -1), "draw")):
+        with pytest.raises(FidelityError, match=says):
+            ladder.check_ladder(*words)
+    short = tube.case(tube.Tube(length=12.0), beams=60)
+    with pytest.raises(FidelityError, match="needs 19 m of tunnel"):
+        ladder.climb_ladders(short, (), 1, 0, tmp_path)

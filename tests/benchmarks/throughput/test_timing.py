@@ -1,4 +1,6 @@
-"""The stopwatch counts what was done, and drops nothing."""
+"""The stopwatch counts what was done, peers do the same work or say what they do instead, and tables say what was measured."""
+
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -6,10 +8,13 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from benchmarks.throughput import timing
+from benchmarks.reference import Agreement
+from benchmarks.results import environment_facts
+from benchmarks.throughput import report, timing
 from benchmarks.throughput.config import ThroughputConfig
-from benchmarks.throughput.loops import environment_loop
-from benchmarks.throughput.timing import Loop, Timing, digest, measure
+from benchmarks.throughput.loops import Peer, environment_loop, jaxnav_loop, measure_jaxnav
+from benchmarks.throughput.report import Result
+from benchmarks.throughput.timing import Loop, Speed, Timing, digest, measure
 
 
 def counting(first: float = 0.0) -> Loop:
@@ -63,3 +68,63 @@ def test_sizes_are_measured_once_each_and_stop_at_4096_on_a_cpu(monkeypatch):
     assert ThroughputConfig().sizes() == (1, 16, 256, 1024, 4096)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert ThroughputConfig().sizes()[-1] == 262_144
+
+
+def test_a_peer_that_is_not_installed_is_left_out_with_its_reason(monkeypatch):
+    monkeypatch.setitem(sys.modules, "jaxmarl", None)
+    monkeypatch.setitem(sys.modules, "jaxmarl.environments.jaxnav.jaxnav_env", None)
+    peer = measure_jaxnav((1, 2), Timing(), lambda _: None)
+    assert peer.speeds == []
+    assert "jaxmarl" in peer.left_out["all"]
+
+
+def test_a_peer_that_breaks_is_left_out_with_its_reason():
+    def broken(n_envs: int) -> Loop:
+        raise RuntimeError("RESOURCE_EXHAUSTED: 1 TiB" if n_envs > 4 else "no such map")
+
+    peer = measure_jaxnav((4, 8), Timing(), lambda _: None, broken)
+    assert peer.left_out == {"4": "RuntimeError: no such map", "8": "out of memory"}
+    assert peer.speeds == []
+
+
+def test_jaxnav_has_as_many_beams_as_ours_and_one_agent():
+    pytest.importorskip("jaxmarl")
+    loop = jaxnav_loop(3)
+    carry = jax.jit(loop.reset)(jax.random.key(0), loop.params)
+    (obs, _), rest, done = jax.jit(loop.step)(jax.random.key(1), carry, loop.params)
+    assert np.isfinite(float(rest))
+    assert 0.0 <= float(done) <= 1.0
+    assert {name: value.shape for name, value in obs.items()} == {"agent_0": (3, 16 + 5)}
+
+
+def speed(n_envs: int, *rates: float) -> Speed:
+    return Speed(n_envs, 10, 1.5, list(rates), 0.1, 42.0)
+
+
+@pytest.fixture
+def result() -> Result:
+    facts = {"device": "NVIDIA H200", "cpu_cores": 16, "jax": "0.11", "date": "2026-01-01"}
+    found = Result(ThroughputConfig(repeats=3), facts, {"name": "t", "length": 351.0, "lining": "pockets"}, 16)
+    found.exactness = Agreement(320, 2e-4, 1, 0)
+    found.speeds = [speed(16, 90.0, 100.0, 120.0), speed(256, 1800.0, 2000.0, 2100.0)]
+    found.peers = [Peer("jaxnav", "JaxNav", "0.2", [speed(16, 25.0)], {"256": "out of memory"})]
+    return found
+
+
+def test_ratios_are_of_medians_at_the_same_size(result):
+    assert result.ratios(result.peers[0]) == {16: 4.0}
+
+
+def test_the_tables_hold_speeds_ratios_and_what_was_left_out(result):
+    text = report.as_text(result)
+    for said in ("1.9 k to 2.05 k", "jaxnav, 256: out of memory", "500,000.0", "32 k", "4 at 16", "0 wrong"):
+        assert said in text, said
+
+
+def test_a_record_names_sensor_and_texture_and_how_to_measure_again(result):
+    result.config = ThroughputConfig(n=(16,), sensor="vlp16", texture=0.5, poses=0)
+    result.environment = environment_facts()
+    result.tunnel["tunnels"], result.exactness = 1, None
+    found = report.records_of(result)
+    assert [record.id for record in found] == ["speed/cpu-vlp16-texture-16", "speed/cpu-vlp16-texture-256"]
+    assert "--sensor vlp16 --texture 0.5 --n 16 --poses 0" in found[0].command

@@ -1,5 +1,6 @@
 """Gymnasium and Stable-Baselines3 get the scan of a LiDAR in three dimensions as an image."""
 
+import jax
 import numpy as np
 import pytest
 
@@ -8,6 +9,9 @@ from subterra_jax.adapters.kernel import as_observation
 from subterra_jax.adapters.single import SubterraEnv
 from subterra_jax.adapters.task import Task
 from subterra_jax.parts import make_sensor
+from subterra_jax.parts.part import Boxes
+from subterra_jax.pictures import top_down as drawing
+from subterra_jax.pictures.views import make_view
 
 TASK = "Subterra/TraverseShort-v1"
 
@@ -53,3 +57,50 @@ def test_one_environment_and_a_batch_give_the_same_images_within_their_space():
     policy = sb3.PPO("MultiInputPolicy", envs, n_steps=8, batch_size=8, device="cpu")
     action, _ = policy.predict(batch)
     assert action.shape == (2, 2)
+
+
+def colours(picture):
+    assert picture.shape == (480, 480, 3)
+    assert picture.dtype == np.uint8
+    return {tuple(int(c) for c in colour) for colour in np.unique(picture.reshape(-1, 3), axis=0)}
+
+
+@pytest.fixture(scope="module")
+def begun():
+    env, params = st.make("Subterra/Obstructed-v1", "subterra-351")
+    obs, state = jax.device_get(jax.jit(env.reset)(jax.random.key(1), params))
+    return env, params, state, obs
+
+
+def at(begun, station):
+    """The picture with the robot elsewhere on the centreline."""
+    env, params, state, obs = begun
+    row = round(station / float(params.tunnel.spacing))
+    moved = state.replace(position=np.asarray(params.tunnel.grid[row, :2]), station=np.float32(station))
+    return colours(make_view("top").picture(env, params, moved, obs))
+
+
+def test_the_plan_shows_walls_beams_and_robot(begun):
+    assert at(begun, 0.0) >= {drawing.BACKGROUND, drawing.WALL, drawing.BEAM, drawing.ROBOT}
+
+
+def test_the_goal_and_the_boxes_are_shown_where_they_are_near(begun):
+    goal = float(begun[2].goal.station)
+    assert drawing.GOAL in at(begun, goal - 5.0)
+    assert drawing.GOAL not in at(begun, goal - 20.0 if goal > 30.0 else goal + 20.0)
+    start = float(begun[2].station)  # boxes stand ahead of it
+    assert any(drawing.BOX in at(begun, start + ahead) for ahead in (15.0, 30.0, 45.0))
+
+
+def test_a_box_and_a_goal_are_drawn_where_they_are():
+    boxes = Boxes(centre=np.array([[3.0, 4.0]]), axis=np.array([[0.0, 1.0]]), half=np.array([[1.0, 0.5]]))
+    goal = np.array([[-5.0, -2.0], [-5.0, 2.0]])
+    picture = drawing.top_down(
+        np.zeros((0, 2)), np.zeros(2), 0.0, 0.4, np.zeros(4), view=24.0, size=240, goal=goal, boxes=[boxes]
+    )
+    rows, columns = np.nonzero((picture == drawing.BOX).all(axis=2))
+    x, y = (columns + 0.5 - 120) / 10, (120 - rows - 0.5) / 10
+    assert [x.min(), x.max(), y.min(), y.max()] == pytest.approx([2.5, 3.5, 3.0, 5.0], abs=0.11)
+    rows, columns = np.nonzero((picture == drawing.GOAL).all(axis=2))
+    assert np.ptp(rows) == pytest.approx(40, abs=2)
+    assert np.abs((columns + 0.5 - 120) / 10 + 5.0).max() < 0.2

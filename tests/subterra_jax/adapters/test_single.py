@@ -1,6 +1,7 @@
 """The Gymnasium adapter: both checkers, seeding, and the same numbers as the environment beneath."""
 
 import copy
+import importlib
 import os
 import subprocess
 import sys
@@ -17,6 +18,7 @@ import subterra_jax as st
 from subterra_jax.adapters import register_tasks
 from subterra_jax.adapters.kernel import start_streams, take_key
 from subterra_jax.adapters.single import SubterraEnv
+from subterra_jax.pictures.views import make_view
 
 TASK, FURTHER = "Subterra/TraverseShort-v1", "Subterra/Relocalise-v1"
 # Actions are m/s and rad/s, and a dead-reckoned distance has no bounds; the checkers would like it otherwise.
@@ -117,20 +119,6 @@ def test_observations_are_not_overwritten_by_later_steps(env):
     np.testing.assert_array_equal(second, held)
 
 
-def test_an_episode_runs_to_its_end_and_info_is_plain_python(env):
-    env.reset(seed=0)
-    for k in range(600):
-        obs, reward, terminated, truncated, info = env.step(np.array([0.05, 0.0]))
-        assert isinstance(reward, float)
-        assert not terminated
-        assert truncated == (k == 599)
-    assert isinstance(info["success"], bool)
-    assert isinstance(info["coverage"], float)
-    assert info["station"] == pytest.approx(3.0, abs=0.05)
-    assert reward == pytest.approx(sum(value for name, value in info.items() if name.startswith("reward_")), abs=1e-5)
-    assert obs.dtype == np.float32
-
-
 def test_misuse_is_told_in_one_sentence(env):
     with pytest.raises(error.ResetNeeded, match="reset"):
         env.step(np.zeros(2))
@@ -168,3 +156,25 @@ def test_the_picture_is_drawn_when_asked_for(env):
     assert (picture.shape, picture.dtype) == ((480, 480, 3), np.uint8)
     env.render_mode = None
     assert env.render() is None
+
+
+@pytest.mark.parametrize(
+    ("adapter", "library", "package"),
+    [
+        ("sb3", "stable_baselines3.common.vec_env.base_vec_env", "stable-baselines3"),
+        ("brax", "brax.envs.base", r"'subterra-jax\[brax\]'"),
+    ],
+)
+def test_a_missing_library_is_named_with_the_command_that_installs_it(adapter, library, package, monkeypatch):
+    monkeypatch.setitem(sys.modules, library, None)
+    monkeypatch.delitem(sys.modules, f"subterra_jax.adapters.{adapter}", raising=False)
+    with pytest.raises(st.SubterraError, match=f"pip install {package}$") as caught:
+        importlib.import_module(f"subterra_jax.adapters.{adapter}")
+    assert isinstance(caught.value, ImportError)
+
+
+def test_a_view_without_mujoco_names_the_command_that_installs_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(st.SubterraError, match=r"pip install mujoco$") as caught:
+        make_view("mujoco")
+    assert isinstance(caught.value, ImportError)

@@ -1,5 +1,8 @@
 """Leg kinematics and statics against MuJoCo."""
 
+import dataclasses
+
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -8,6 +11,8 @@ import pytest
 from subterra_jax.b2 import constants as b2
 from subterra_jax.b2 import kinematics
 from subterra_jax.b2.model import robot_spec
+from subterra_jax.b2.tasks import make
+from subterra_jax.b2.walk import command_joints
 
 ANGLES = np.random.default_rng(0).uniform([-0.6, -0.3, -2.4], [0.6, 1.5, -0.6], (4, 3)).astype(np.float32)
 
@@ -57,3 +62,66 @@ def test_the_calf_carries_a_quarter_of_the_robot_with_41_newton_metres():
     torque = kinematics.load_torques(pose, jnp.full(4, b2.TOTAL_MASS * 9.81 / 4.0))
     np.testing.assert_allclose(torque[:, 2], 0.35 * np.sin(0.7) * 74.5803 * 9.81 / 4.0, rtol=1e-4)
     np.testing.assert_allclose(torque[0, 0], -torque[1, 0], rtol=1e-5)
+
+
+PERIOD = 0.02
+
+
+@pytest.fixture(scope="module")
+def in_c():
+    env, _ = make(engine="mujoco")
+    return env.physics
+
+
+@pytest.fixture(scope="module")
+def moment(walking):
+    """Eight robots on their way, where their anchors lie, and where their servos are to go."""
+    params = walking.told((0.5, 0.0, 0.0))
+    aims = jax.jit(jax.vmap(lambda s: command_joints(s, jnp.zeros(12), PERIOD, params)[1]))
+
+    def seen(state):
+        origin = params.track.position[state.anchor]
+        return jax.device_get((state.body, aims(state), origin, state.build))
+
+    _, state = walking.reset(3, params)
+    for k in range(20):
+        _, state, *_ = walking.step(k, state, params=params)
+    return params, state, seen
+
+
+def of(tree, k):
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[k], tree)
+
+
+@pytest.mark.slow
+def test_half_a_second_in_both_engines_ends_in_nearly_the_same_pose(walking, moment, in_c):
+    """From one state and the same targets, 125 steps of physics: in C on the tunnel's own boxes, in MJX on planes."""
+    params, state, seen = moment
+    robots, bodies = range(3), of(state.body, slice(3))
+    shift = np.zeros((3, 3), np.float32)
+    for k in range(25):
+        _, aims, origin, build = seen(state)
+        before = state
+        _, state, _, terminated, truncated, _ = walking.step(100 + k, state, params=params)
+        assert not (terminated | truncated)[:3].any()
+        # A robot that has passed on to another anchor is distinguished from there.
+        track = params.track.position
+        after = [in_c.bench.run(of(bodies, r), aims[r], origin[r], of(build, r), in_c.substeps) for r in robots]
+        bodies = jax.tree.map(lambda *parts: np.stack(parts), *after)
+        shift = np.asarray(track[state.anchor] - track[before.anchor])[:3]
+        bodies = dataclasses.replace(bodies, qpos=bodies.qpos - np.pad(shift, ((0, 0), (0, 16))))
+    np.testing.assert_allclose(bodies.qpos[:, 7:], state.body.qpos[:3, 7:], atol=0.03)
+    np.testing.assert_allclose(bodies.qpos[:, :7], state.body.qpos[:3, :7], atol=0.03)
+    assert np.abs(np.asarray(state.body.qvel[:3, 6:])).max() > 0.5, "nothing moved"
+
+
+@pytest.mark.slow
+def test_a_robot_s_step_depends_neither_on_who_was_there_before_nor_on_the_batch(moment, in_c):
+    _, state, seen = moment
+    what = seen(state)
+    alone = [in_c.bench.run(*of(what, k), in_c.substeps) for k in (2, 5, 2)]
+    together = in_c.run_rows(*of(what, slice(6)))
+    for name in ("qpos", "qvel", "warmstart"):
+        assert np.array_equal(getattr(alone[0], name), getattr(alone[2], name))
+        assert np.array_equal(getattr(alone[0], name), getattr(together, name)[2])
+        assert not np.array_equal(getattr(alone[0], name), getattr(alone[1], name))

@@ -94,16 +94,6 @@ def reward_cases_of_t0(id):
         yield state, command, np.tile([0.7, -0.3], (n, 1))
 
 
-def test_weights_are_those_of_the_params():
-    env, params, *_ = made("Subterra/Traverse-v1")
-    weights = params.reward.replace(terminal=7.0, coverage=0.0, jerk=1.0)
-    heavy = params.replace(reward=weights, goal_coverage=0.0)
-    start = jax.jit(env.reset)(jax.random.key(0), params)[1]
-    *_, info = jax.jit(env.step)(jax.random.key(1), start, jnp.array([2.0, 0.5]), heavy)
-    names = ("terminal", "coverage", "jerk")
-    assert [float(info[f"reward_{name}"]) for name in names] == [7.0, 0.0, -2.5]
-
-
 def test_ground_covered_before_earns_nothing():
     env, params, *_ = made("Subterra/TraverseShort-v1")
     _, state = jax.jit(env.reset)(jax.random.key(0), params)
