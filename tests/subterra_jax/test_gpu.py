@@ -14,8 +14,8 @@ from subterra_jax import lidar
 from subterra_jax.lidar import gpu, kernels
 from subterra_jax.parts import unicycle
 from subterra_jax.tunnel import CONTACT_REACH, Tunnel, node_at
-from tests.subterra_jax.lowering import for_nvidia
 from tests.subterra_jax.modes import wide
+from tests.subterra_jax.placing import for_nvidia
 
 KINDS = ("straight:train", "cast:train", "sprayed:train", "masonry:train", "universal:test-unseen", "rock:test-unseen")
 NAMES = [None, *(f"open:{kind}:0" for kind in KINDS)]

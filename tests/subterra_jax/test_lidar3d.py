@@ -18,7 +18,7 @@ from subterra_jax.lidar3d import beams, casting, finding, fused
 from subterra_jax.lidar3d.relief import ARRAYS, Relief
 from subterra_jax.lidar3d.surface import BOX_CORNERS, BOX_FACES, Axis, Triangles
 from tests.subterra_jax import surfaces
-from tests.subterra_jax.lowering import for_nvidia
+from tests.subterra_jax.placing import for_nvidia
 
 RADIUS, LENGTH = 2.0, 60.0
 N_SCANS, N_BEAMS = 32, 16

@@ -9,7 +9,7 @@ from subterra_jax.host.texture import brightness, wall_angle
 from subterra_jax.pictures.camera import TunnelChoice
 from subterra_jax.pictures.stage import Piece, carrier_parts, stage_spec
 from subterra_jax.pictures.surfaces import short_shell, tunnel_surfaces
-from tests.subterra_jax.drawn import draw
+from tests.subterra_jax.placing import draw
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""The stopwatch counts what was done, peers do the same work or say what they do instead, and tables say what was measured."""
+"""The stopwatch counts what was done, peers do the same work, and tables say what was measured."""
 
 import sys
 

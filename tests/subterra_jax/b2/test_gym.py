@@ -22,7 +22,7 @@ from subterra_jax.physics.rotations import yaw
 from subterra_jax.physics.stage import RobotError
 from subterra_jax.policies import PolicyError
 from subterra_jax.rules import StartParams
-from tests.subterra_jax.drawn import draw
+from tests.subterra_jax.placing import draw
 
 ID = "Subterra/B2Traverse-v1"
 QUIET = {"rate": 0.0, "gravity": 0.0, "angle": 0.0, "speed": 0.0}
