@@ -1,4 +1,4 @@
-"""Scores of estimated trajectories: absolute and relative errors as `evo` defines them, along the tunnel and across."""
+"""Scores of estimated trajectories: errors along the tunnel and across it, absolute ones as `evo` defines them."""
 
 import dataclasses
 import json
@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from benchmarks.command import BenchmarkError
 from benchmarks.results import markdown_table
@@ -22,63 +22,10 @@ from benchmarks.slam.tracks import (
 )
 
 
-@dataclasses.dataclass(frozen=True)
-class Spread:
-    """Statistics of non-negative errors; `std` is about the mean, as in evo."""
-
-    rmse: float
-    mean: float
-    median: float
-    std: float
-    min: float
-    max: float
-
-    @classmethod
-    def of(cls, errors: Float[np.ndarray, " n"]) -> "Spread":
-        rmse = float(np.sqrt(np.mean(errors**2)))
-        rest = (np.mean(errors), np.median(errors), np.std(errors), np.min(errors), np.max(errors))
-        return cls(rmse, *(float(value) for value in rest))
-
-
 def absolute_errors(track: Track) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
     """Returns the error of each position (estimate less truth, fixed frame, m) and of each attitude (rad)."""
     turn = track.true_rotation.inv() * track.rotation
     return track.position - track.true_position, turn.magnitude()
-
-
-def pairs_by_distance(track: Track, delta: float) -> Int[np.ndarray, "k 2"]:
-    """Returns consecutive pieces of the true path, each ended by the first pose at least `delta` m on.
-
-    Source: evo's RPE with `pairs_from_reference` and without `all_pairs`.
-    """
-    ends, since = [0], 0.0
-    for k, step in enumerate(np.linalg.norm(np.diff(track.true_position, axis=0), axis=1), start=1):
-        since += float(step)
-        if since >= delta:
-            ends.append(k)
-            since = 0.0
-    return np.column_stack([ends[:-1], ends[1:]])
-
-
-def relative_errors(
-    track: Track, pairs: Int[np.ndarray, "k 2"]
-) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, " k"]]:
-    """Returns the error of each piece's motion, as seen from its first pose.
-
-    Args:
-        track: Aligned track.
-        pairs: Indices of first and last pose, `(k, 2)`.
-
-    Returns:
-        Estimated less true displacement, turned into the fixed frame by the true attitude (m), and error of the turn
-        (rad). Their lengths are evo's relative errors.
-    """
-    first, last = pairs.T
-    motion = track.rotation[first].inv().apply(track.position[last] - track.position[first])
-    true_motion = track.true_position[last] - track.true_position[first]
-    turn = track.rotation[first].inv() * track.rotation[last]
-    true_turn = track.true_rotation[first].inv() * track.true_rotation[last]
-    return track.true_rotation[first].apply(motion) - true_motion, (true_turn.inv() * turn).magnitude()
 
 
 def rms(values: Float[np.ndarray, " n"]) -> float:
@@ -105,15 +52,8 @@ class Score:
     across_rms: float  # RMS error of the offset to the left of the axis, m
     up_rms: float  # RMS error of the height over the axis, m
     drift: float | None  # |along_final| in % of the distance; `None` without motion
-    piece: float  # Length of the pieces of path for the next four figures, m
-    # RMS error of a piece's motion along the axis, as seen from its first pose, in % of its length; `None` where no
-    # piece is so long
-    piece_along: float | None
-    piece_across: float | None  # RMS error of a piece's motion to the left, in % of its length
-    piece_turn: float | None  # RMS error of a piece's turn, °/m
-    rpe: Spread | None  # Spread of the pieces' errors, m
-    ape: Spread  # Spread of the position errors, m
-    ape_turn: Spread  # Spread of the attitude errors, °
+    ape: float  # RMS error of the position, m
+    ape_turn: float  # RMS error of the attitude, °
     # Distance driven when the error of the station first exceeds 1 m, m; `None` where it never does
     reach: float | None = None
 
@@ -132,7 +72,6 @@ def score_files(
     *,
     axis: Path | None = None,
     alignment: Alignment = "origin",
-    piece: float = 10.0,
     name: str = "",
 ) -> tuple[Score, Curve]:
     """Scores one TUM file against another.
@@ -142,14 +81,11 @@ def score_files(
         truth: `lidar.tum` of a recording's truth.
         axis: `axis.csv`; by default the one beside the truth, or else the true path gives the directions.
         alignment: `origin`, `se3` or `none`.
-        piece: Length of the pieces of path, m.
         name: Name of the recording; by default the estimate's file name.
 
     Raises:
         BenchmarkError: A file is missing or wrong, the trajectories share no times, or the poses are not the LiDAR's.
     """
-    if not piece > 0.0:
-        raise BenchmarkError(f"piece must be above 0 m, got {piece}")
     track = read_track(estimate, truth, alignment)
     check_rate(estimate, track)
     if alignment == "origin":
@@ -159,7 +95,7 @@ def score_files(
     if axis is None and (truth.parent / AXIS_FILE).is_file():
         axis = truth.parent / AXIS_FILE
     line = axis_from_path(track.true_position) if axis is None else axis_from_file(axis)
-    return score_track(track, line, alignment, piece, name or estimate.stem)
+    return score_track(track, line, alignment, name or estimate.stem)
 
 
 LEAST_RATE = 1.0  # poses a second; fewer leave out where a program errs
@@ -208,7 +144,7 @@ def _check_frame(estimate: Path, track: Track) -> None:
         )
 
 
-def score_track(track: Track, axis: Axis, alignment: str, piece: float, name: str) -> tuple[Score, Curve]:
+def score_track(track: Track, axis: Axis, alignment: str, name: str) -> tuple[Score, Curve]:
     """Scores an aligned track; returns its errors against distance as well."""
     error, turn = absolute_errors(track)
     parts, travelled = axis.coordinates(track.position) - axis.coordinates(track.true_position), track.travelled
@@ -217,8 +153,8 @@ def score_track(track: Track, axis: Axis, alignment: str, piece: float, name: st
         name=name, distance=distance, covered=track.covered, poses=len(track.time), alignment=alignment,
         axis=axis.source, along_final=float(parts[-1, 0]), along_rms=rms(parts[:, 0]), across_rms=rms(parts[:, 1]),
         up_rms=rms(parts[:, 2]), drift=100.0 * abs(float(parts[-1, 0])) / distance if distance > 0.0 else None,
-        piece=piece, ape=Spread.of(np.linalg.norm(error, axis=1)), ape_turn=Spread.of(np.degrees(turn)),
-        reach=reach_of(travelled, parts[:, 0]), **_pieces(track, axis, piece),
+        ape=rms(np.linalg.norm(error, axis=1)), ape_turn=rms(np.degrees(turn)),
+        reach=reach_of(travelled, parts[:, 0]),
     )  # fmt: skip
     return score, Curve(travelled, parts)
 
@@ -232,21 +168,6 @@ def reach_of(travelled: Float[np.ndarray, " n"], along: Float[np.ndarray, " n"])
     return float(travelled[beyond[0]]) if len(beyond) else None
 
 
-def _pieces(track: Track, axis: Axis, piece: float) -> dict[str, Any]:
-    pairs = pairs_by_distance(track, piece)
-    if not len(pairs):
-        return {"piece_along": None, "piece_across": None, "piece_turn": None, "rpe": None}
-    error, turn = relative_errors(track, pairs)
-    length = np.diff(track.travelled[pairs], axis=1)  # a little more than `piece`
-    parts = axis.resolve(error, track.true_position[pairs.sum(axis=1) // 2]) / length
-    return {
-        "piece_along": 100.0 * rms(parts[:, 0]),
-        "piece_across": 100.0 * rms(parts[:, 1]),
-        "piece_turn": float(np.degrees(rms(turn / length[:, 0]))),
-        "rpe": Spread.of(np.linalg.norm(error, axis=1)),
-    }
-
-
 @dataclasses.dataclass(frozen=True)
 class ScoreConfig:
     """Settings of a scoring."""
@@ -256,7 +177,6 @@ class ScoreConfig:
     axis: Path | None = None  # `axis.csv`, if it is not beside the truth.
     # `origin`: the first pose is known; `se3`: best fit; `none`: poses in the tunnel's frame.
     alignment: Alignment = "origin"
-    piece: float = 10.0  # Length of the pieces of path for relative errors, m.
     out: Path | None = None  # Folder for `scores.json` and `scores.md`.
 
 
@@ -285,9 +205,7 @@ def _score_path(path: Path, config: ScoreConfig) -> list[ProgramScore]:
     pairs = _pairs(path, config.truth) if path.is_dir() else [(path, _find_truth(path, config.truth))]
     program, scores = path.name if path.is_dir() else path.parent.name, []
     for estimate, truth in pairs:
-        score, _ = score_files(
-            estimate, truth, axis=config.axis, alignment=config.alignment, piece=config.piece, name=estimate.stem
-        )
+        score, _ = score_files(estimate, truth, axis=config.axis, alignment=config.alignment, name=estimate.stem)
         scores.append(ProgramScore(program, score))
     return scores
 
@@ -315,7 +233,7 @@ def _pairs(folder: Path, truth: Path) -> list[tuple[Path, Path]]:
 
 HEAD = (
     "recording", "program", "driven, m", "covered %", "along at the end, m", "drift %", "along, m", "across, m",
-    "up, m", "along % of pieces", "across % of pieces", "turn, °/m", "APE, m", "RPE, m",
+    "up, m", "APE, m", "APE, °",
 )  # fmt: skip
 
 
@@ -330,9 +248,8 @@ def as_rows(scores: list[ProgramScore]) -> list[tuple[str, ...]]:
         s = one.score
         rows.append((
             s.name, one.program, cell(s.distance, 1), cell(100.0 * s.covered, 0), f"{s.along_final:+.2f}",
-            cell(s.drift), cell(s.along_rms, 3), cell(s.across_rms, 3), cell(s.up_rms, 3), cell(s.piece_along),
-            cell(s.piece_across), cell(s.piece_turn, 3), cell(s.ape.rmse, 3),
-            cell(None if s.rpe is None else s.rpe.rmse, 3),
+            cell(s.drift), cell(s.along_rms, 3), cell(s.across_rms, 3), cell(s.up_rms, 3), cell(s.ape, 3),
+            cell(s.ape_turn, 2),
         ))  # fmt: skip
     return rows
 
@@ -341,8 +258,7 @@ def as_markdown(scores: list[ProgramScore]) -> str:
     """Returns the table with a note on its columns."""
     first = scores[0].score
     return markdown_table(HEAD, as_rows(scores)) + (
-        f"\nRoot mean squares over the recording, alignment `{first.alignment}`. Pieces are {first.piece:g} m of path: "
-        "RMS error of their motion in % of it. APE and RPE are root mean squares as `evo` defines them.\n"
+        f"\nRoot mean squares over the recording, alignment `{first.alignment}`; APE is that of `evo`.\n"
     )
 
 

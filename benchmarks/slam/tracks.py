@@ -41,10 +41,6 @@ class Axis:
         stretch = np.where(inside, np.maximum(1.0 - curvature[near] * aside[:, 1], _LEAST_STRETCH), 1.0)
         return np.column_stack([self.station[near] + aside[:, 0] / stretch, aside[:, 1:]])
 
-    def resolve(self, vectors: Float[np.ndarray, "k 3"], at: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3"]:
-        """Resolves vectors of the fixed frame along, left and up of the axis near positions `at`."""
-        return np.einsum("kij,kj->ki", self.frames[self.nearest(at)], vectors)
-
 
 def axis_from_file(path: Path) -> Axis:
     """Reads the `axis.csv` of a recording's truth.
