@@ -17,14 +17,7 @@ from benchmarks.fidelity.case import Case, case_hash
 from benchmarks.fidelity.faults import runner
 from benchmarks.fidelity.faults.runner import Bench, is_bold, judge_outcomes, list_jobs, run_jobs
 from benchmarks.fidelity.files import FidelityError, read_kept, write_csv, write_json
-from benchmarks.fidelity.inputs import (
-    Inputs,
-    SplitConfig,
-    complete_inputs,
-    foreign_scene,
-    read_case,
-    split_recording,
-)
+from benchmarks.fidelity.inputs import Inputs, SplitConfig, complete_inputs, foreign_scene, read_case, split_recording
 from benchmarks.fidelity.judge import Judgement
 from benchmarks.fidelity.leaks import find_leaks
 from benchmarks.fidelity.report import write_report

@@ -64,8 +64,7 @@ def beam_directions(
     # The sweep turns one way or the other; the right one leaves the smaller spread.
     residuals = [_wrap(azimuth - sense * turn) for sense in (1.0, -1.0)]
     sense, residual = max(
-        zip((1.0, -1.0), residuals, strict=True),
-        key=lambda pair: float(np.abs(np.exp(1j * pair[1][back]).sum())),
+        zip((1.0, -1.0), residuals, strict=True), key=lambda pair: float(np.abs(np.exp(1j * pair[1][back]).sum()))
     )
     look, known = np.zeros_like(points, dtype=float), np.zeros(back.shape, bool)
     for ring in np.flatnonzero(back.sum(axis=1) >= _FEWEST_RETURNS):

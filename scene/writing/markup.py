@@ -43,13 +43,7 @@ def cross_product(a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"]) -> Float
 
 
 def add_box(
-    world: ET.Element,
-    name: str,
-    half: ArrayLike,
-    centre: ArrayLike,
-    rotation: Rotation,
-    bits: int,
-    **attributes: str,
+    world: ET.Element, name: str, half: ArrayLike, centre: ArrayLike, rotation: Rotation, bits: int, **attributes: str
 ) -> None:
     """Adds a fixed box that bodies touch whose affinity has one of `bits`; half sizes and centre in m."""
     ET.SubElement(world, "geom", {

@@ -18,13 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from scene.bore import Bore
 from scene.writing.furnished import Furnished, FurnitureConfig
-from scene.writing.markup import (
-    SceneParts,
-    add_box,
-    add_mesh,
-    format_numbers,
-    format_quaternion,
-)
+from scene.writing.markup import SceneParts, add_box, add_mesh, format_numbers, format_quaternion
 from scene.writing.mesh import has_rings, split_lining, split_skin
 from scene.writing.planar import Walls
 from scene.writing.track import Track

@@ -54,10 +54,7 @@ VERSIONS = ("mujoco", "mujoco-mjx", "jax", "numpy", "scipy", "trimesh", "embreex
 
 
 def report_content(
-    case: Case,
-    inputs: Inputs,
-    judgement: Judgement,
-    controls: list[dict[str, Any]] | None = None,
+    case: Case, inputs: Inputs, judgement: Judgement, controls: list[dict[str, Any]] | None = None
 ) -> dict[str, Any]:
     scored, null = judgement.scored["base"], judgement.scored["null"]
     worst = min((v, c) for c, v in scored.categories.items() if v is not None) if scored.evaluated else (None, None)
@@ -175,11 +172,7 @@ def _split_entry(case: Case, inputs: Inputs) -> dict[str, Any]:
 
 
 def write_report(
-    folder: Path,
-    case: Case,
-    inputs: Inputs,
-    judgement: Judgement,
-    controls: list[dict[str, Any]] | None,
+    folder: Path, case: Case, inputs: Inputs, judgement: Judgement, controls: list[dict[str, Any]] | None
 ) -> dict[str, Any]:
     content = report_content(case, inputs, judgement, controls)
     rows = controls or []

@@ -55,9 +55,7 @@ def unrolled(case: Case, source: Source) -> deviation.Unrolled:
     return deviation.hold_map(case) if source == "recording" else deviation.truth_map(case)
 
 
-def _by_cells(
-    statistic: Callable[[Float[np.ndarray, "k m"]], tuple[float, str]],
-) -> Callable[[Case, Source], Series]:
+def _by_cells(statistic: Callable[[Float[np.ndarray, "k m"]], tuple[float, str]]) -> Callable[[Case, Source], Series]:
     def compute(case: Case, source: Source) -> Series:
         one, rows = unrolled(case, source), round(SHORT / deviation.CELL)
         last = max(len(one.offset) - rows, 0)  # one window where it is longer
