@@ -192,14 +192,10 @@ def _fit_cloud(placed: Placed, config: ReconstructConfig, progress: Stages) -> R
     bore, provenance = add_lining(smooth, sections, cloud, config.lining, railway=seen.shows_rails)
     stage.advance()
     facts = {
-        "length_fixed_by": "registered cloud as given",
-        **placed.facts,
-        **_describe_growth(config, _ARBITRARY if located is None else "with the trajectory"),
-        "returns": cloud.returns,
-        "points": len(cloud.points),
-        "flat_floor": sections.flat_floor,
-        **describe_bore(bore),
-    }
+        "length_fixed_by": "registered cloud as given", **placed.facts,
+        **_describe_growth(config, _ARBITRARY if located is None else "with the trajectory"), "returns": cloud.returns,
+        "points": len(cloud.points), "flat_floor": sections.flat_floor, **describe_bore(bore),
+    }  # fmt: skip
     removed = tuple(part.shifted(-sections.grid.start) for part in cleaned.removed)
     return Reconstruction(
         bore, cloud.origin, placed.record, facts, provenance,

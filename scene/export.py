@@ -221,14 +221,10 @@ def export(config: ExportConfig) -> Path:
         require_folder(out)
     manifest = json.loads(manifest_path.read_text())
     facts = {
-        "name": manifest["name"],
-        "provenance": manifest.get("input_provenance", "unknown"),
-        "licence": config.licence,
-        "origin": manifest["frame"]["origin"],
-        "crs": manifest["frame"].get("crs") or "not stated",
-        "frame": "tunnel frame, z up, m; add origin for the input's frame",
-        "made_by": "Subterra",
-    }
+        "name": manifest["name"], "provenance": manifest.get("input_provenance", "unknown"), "licence": config.licence,
+        "origin": manifest["frame"]["origin"], "crs": manifest["frame"].get("crs") or "not stated",
+        "frame": "tunnel frame, z up, m; add origin for the input's frame", "made_by": "Subterra",
+    }  # fmt: skip
     parts = read_parts(config.scene / ("scene_furnished.xml" if config.furnished else "scene.xml"))
     if config.to == "sdf":
         with replace_folder(out) as folder:

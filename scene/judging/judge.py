@@ -78,15 +78,12 @@ class Judgement:
         if self.returns is None or self.coverage is None:
             return result
         return {
-            **result,
-            "tolerance": self.tolerance,
-            "returns": float(self.returns.weight.sum()),
-            "share": {**self.shares, "scattered": self.scattered},
-            "wall_seen": self.coverage.share,
+            **result, "tolerance": self.tolerance, "returns": float(self.returns.weight.sum()),
+            "share": {**self.shares, "scattered": self.scattered}, "wall_seen": self.coverage.share,
             "unseen": [vars(piece) for piece in self.coverage.pieces[:_LISTED]],
             "places": [vars(place) for place in self.places[:_LISTED]],
             "worst_stations": [{"start": a, "end": b, "unexplained": share} for a, b, share in self.worst],
-        }
+        }  # fmt: skip
 
     def summary(self) -> str:
         """Return the shares in one line for people."""

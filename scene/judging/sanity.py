@@ -107,15 +107,10 @@ def doubt_bore(bore: Bore, facts: dict[str, Any], provenance: dict[str, str], su
     to show pockets.
     """
     return [
-        *_doubt_size(bore, str(facts.get("unit", "m"))),
-        *_doubt_grade(bore, str(facts.get("axes", "xyz"))),
-        *_doubt_lying(bore),
-        *doubt_shaft(bore, str(facts.get("axes", ""))),
-        *_doubt_dents(bore),
-        *_doubt_poses(facts),
-        *_doubt_rounding(facts),
-        *(_tell_standard(bore, provenance) if surveyed else []),
-    ]
+        *_doubt_size(bore, str(facts.get("unit", "m"))), *_doubt_grade(bore, str(facts.get("axes", "xyz"))),
+        *_doubt_lying(bore), *doubt_shaft(bore, str(facts.get("axes", ""))), *_doubt_dents(bore),
+        *_doubt_poses(facts), *_doubt_rounding(facts), *(_tell_standard(bore, provenance) if surveyed else []),
+    ]  # fmt: skip
 
 
 def _doubt_size(bore: Bore, unit: str) -> list[Warned]:

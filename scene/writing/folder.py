@@ -194,10 +194,7 @@ def _describe_scene(
             "filled_share": float(bore.filled.mean()),
         },
         "count": {
-            **count,
-            "stations": len(bore.station),
-            "rings": len(bore.ring_station),
-            "pockets": len(bore.pocket),
+            **count, "stations": len(bore.station), "rings": len(bore.ring_station), "pockets": len(bore.pocket),
         },
         "track": describe_track(track, result.seen),
         "provenance": {
