@@ -8,11 +8,14 @@ import mujoco
 import numpy as np
 import pytest
 
+import subterra_jax as st
 from subterra_jax.b2 import constants as b2
 from subterra_jax.b2 import kinematics
+from subterra_jax.b2.gait import load_policy
 from subterra_jax.b2.model import robot_spec
 from subterra_jax.b2.tasks import make
 from subterra_jax.b2.walk import command_joints
+from tests.subterra_jax.b2.conftest import N_ROBOTS
 
 ANGLES = np.random.default_rng(0).uniform([-0.6, -0.3, -2.4], [0.6, 1.5, -0.6], (4, 3)).astype(np.float32)
 
@@ -113,6 +116,26 @@ def test_half_a_second_in_both_engines_ends_in_nearly_the_same_pose(walking, mom
     np.testing.assert_allclose(bodies.qpos[:, 7:], state.body.qpos[:3, 7:], atol=0.03)
     np.testing.assert_allclose(bodies.qpos[:, :7], state.body.qpos[:3, :7], atol=0.03)
     assert np.abs(np.asarray(state.body.qvel[:3, 6:])).max() > 0.5, "nothing moved"
+
+
+@pytest.mark.slow
+def test_in_ten_seconds_robots_of_both_engines_get_equally_far(walking, moment):
+    """Legs are chaotic: from one state, two engines part by metres in 10 s. What stays is how far eight robots get."""
+    params, begun, _ = moment
+    low, high = (jnp.array([0.5, 0.0, side], jnp.float32) for side in (-0.8, 0.8))
+    steered = dataclasses.replace(walking.params.command, low=low, high=high, still=jnp.float32(0.0))
+    params = dataclasses.replace(params, command=steered)
+    env, _ = make(engine="mujoco")
+    in_c, act, far = jax.jit(st.AutoReset(env).step), jax.jit(load_policy()[0].act), []
+    for step in (walking.compiled["step"], in_c):
+        state, action, ended = begun, jnp.zeros((N_ROBOTS, 12)), False
+        for k in range(500):
+            obs, state, _, terminated, *_ = step(jax.random.key(k), state, action, params)
+            action, ended = act(obs), ended | bool(np.any(terminated))
+        far.append(np.abs(np.asarray(params.track.station[state.anchor] - params.track.station[begun.anchor])))
+        assert not ended
+    assert np.mean(far[0]) == pytest.approx(np.mean(far[1]), rel=0.05)
+    assert np.mean(far[0]) > 3.0
 
 
 @pytest.mark.slow
