@@ -165,6 +165,7 @@ def _pictures(drawn: Drawn, radius: float, title: str, count: int, view: View | 
         if view is not None:
             behind[0].set_data(view(row))
         figure.canvas.draw()
+        figure.set_layout_engine("none")  # laying out again takes longer than drawing
         yield np.asarray(figure.canvas.buffer_rgba())[..., :3].copy()  # type: ignore[attr-defined]
     plt.close(figure)
 
