@@ -22,7 +22,7 @@ from subterra_jax.evaluation import Episodes, evaluate
 from subterra_jax.policies import PolicyError, files, load_policy, loading
 from subterra_jax.policies.trained import Trained
 from subterra_jax.recorder import RecorderConfig, record
-from tests.subterra_jax.probes import PROBES
+from tests.subterra_jax.placing import PROBES
 
 pytestmark = pytest.mark.door
 

@@ -15,7 +15,7 @@ from subterra_jax.b2 import tasks, transfer
 from subterra_jax.b2.transfer import Lag, Nod, stand_in
 from subterra_jax.evaluation import listed_episodes
 from subterra_jax.policies import load
-from tests.subterra_jax import probes
+from tests.subterra_jax import placing
 
 
 @pytest.fixture(scope="module")
@@ -146,7 +146,7 @@ def test_figures_of_four_robots_are_what_one_counts_by_hand():
 
 @pytest.mark.parametrize("name", ["nothing", "truth"])
 def test_a_robot_is_driven_by_what_its_agent_declares_and_no_more(name):
-    agent, speed = probes.PROBES[name]
+    agent, speed = placing.PROBES[name]
     env, params = st.make("Subterra/TraverseShort-v1", horizon=3)
     walk, rows = transfer.walk_robots(env, params, agent, listed_episodes(env, params, 2))
     np.testing.assert_allclose(walk.state.command[:, 0], speed, rtol=1e-4)

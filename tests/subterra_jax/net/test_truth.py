@@ -9,7 +9,7 @@ from subterra_jax.baselines import registry
 from subterra_jax.evaluation import Episodes, evaluate
 from subterra_jax.recorder import RecorderConfig, record
 from tests.subterra_jax.net.robots import begun, driven, made
-from tests.subterra_jax.probes import PROBES
+from tests.subterra_jax.placing import PROBES
 
 
 def probe(name):
