@@ -12,9 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
+from subterra_jax.params import check_robot
 from subterra_jax.state import EnvParams
-from subterra_jax.tunnel import CONTACT_REACH
-from subterra_jax.tunnel.blocks import LIDAR_GAP
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,23 +119,18 @@ def _bounds(name: str, needed: Range, leaf: Array) -> tuple[int | float, int | f
 
 
 def _check(params: EnvParams, bounds: dict[str, tuple[int | float, int | float]]) -> None:
-    def extremes(name: str) -> tuple[int | float, int | float]:
-        value = _find(params, name)
-        return bounds.get(name, (float(np.min(value)), float(np.max(value))))
+    def extremes(name: str) -> tuple[Any, Any]:
+        value = np.asarray(_find(params, name))
+        return bounds.get(name, (value.min(), value.max()))
 
     furthest = extremes("lidar.range_max")[1]
     if furthest > params.tunnel.reach + 1e-6:
         raise ValueError(
             f"'lidar.range_max' goes up to {furthest:g} m, but the tunnel was made for {params.tunnel.reach:g} m"
         )
-    gap = extremes("vehicle.radius")[0] - extremes("vehicle.speed_max")[1] * extremes("vehicle.period")[1]
-    if gap < LIDAR_GAP - 1e-6:
-        raise ValueError(
-            f"the least 'vehicle.radius' less one step at the largest 'vehicle.speed_max' leaves {gap:.2f} m between "
-            f"LiDAR and walls, needed are {LIDAR_GAP} m"
-        )
-    if (largest := extremes("vehicle.radius")[1]) > CONTACT_REACH:
-        raise ValueError(f"'vehicle.radius' goes up to {largest:g} m, walls are looked for within {CONTACT_REACH} m")
+    radius, (_, speed), (_, period) = (extremes(f"vehicle.{name}") for name in ("radius", "speed_max", "period"))
+    robot = params.vehicle.replace(radius=np.array(radius), speed_max=speed, period=period)
+    check_robot({"lidar": params.lidar, "vehicle": robot})
 
 
 def _draw(

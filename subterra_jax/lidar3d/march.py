@@ -133,23 +133,14 @@ def wedge_at(tools: Tools, y: Float[Array, "n"], z: Float[Array, "n"]) -> Int[Ar
 
 
 class Step(NamedTuple):
-    """Rays on their way through the cells of a block; distances are from where they began there.
+    """Rays on their way through the cells of a block; distances are from where they began there."""
 
-    Attributes:
-        x: Cell along the axis.
-        wedge: Wedge.
-        reached: Distance at which the ray enters the cell, m.
-        hit: Distance to the nearest triangle met so far, m.
-        entry: Entry of that triangle.
-        going: The ray may still meet one in this block.
-    """
-
-    x: Int[Array, "n"]
+    x: Int[Array, "n"]  # cell along the axis
     wedge: Int[Array, "n"]
-    reached: Float[Array, "n"]
-    hit: Float[Array, "n"]
-    entry: Int[Array, "n"]
-    going: Bool[Array, "n"]
+    reached: Float[Array, "n"]  # distance at which the ray enters the cell, m
+    hit: Float[Array, "n"]  # distance to the nearest triangle met so far, m
+    entry: Int[Array, "n"]  # entry of that triangle
+    going: Bool[Array, "n"]  # the ray may still meet one in this block
 
 
 def _ray_in_cells(tools: Tools, way: Way) -> Ray:

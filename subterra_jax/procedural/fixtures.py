@@ -22,19 +22,12 @@ _OUTLINE = 4000  # points of an outline before it is sampled
 
 @dataclasses.dataclass(frozen=True)
 class Mount:
-    """Place of the LiDAR on the robot.
+    """Place of the LiDAR on the robot."""
 
-    Attributes:
-        height: Height above the floor, m.
-        lateral: Distance to the left of the robot's middle, m.
-        roll: Turn about the axis ahead, rad; the left side rises.
-        pitch: Turn about the axis to the left, rad; above 0 it looks down. Of no account in the plane.
-    """
-
-    height: float
-    lateral: float
-    roll: float
-    pitch: float
+    height: float  # height above the floor, m
+    lateral: float  # distance to the left of the robot's middle, m
+    roll: float  # turn about the axis ahead, rad; the left side rises
+    pitch: float  # turn about the axis to the left, rad; above 0 it looks down. Of no account in the plane
 
     @classmethod
     def draw(cls, rng: np.random.Generator) -> Mount:

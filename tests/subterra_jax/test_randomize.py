@@ -77,7 +77,7 @@ def test_a_randomised_batch_sees_and_moves_as_each_of_its_environments_should(ma
         ({"lidar.range_sigma": LogUniform(0.0, 0.1)}, "must be above 0"),
         ({"horizon": (10.5, 20.0)}, "whole numbers"),
         ({"lidar.range_max": (10.0, 31.0)}, r"'lidar.range_max' goes up to 31 m.*30 m"),
-        ({"vehicle.speed_max": (1.0, 2.5)}, r"leaves 0.15 m between"),
+        ({"vehicle.speed_max": (1.0, 2.5)}, r"less one step of 2.5 m/s"),
     ],
 )
 def test_what_cannot_be_randomised_is_refused_by_name(made, ranges, message):
