@@ -232,9 +232,10 @@ def _worst_windows(bore: Bore, returns: Returns) -> tuple[tuple[float, float, fl
 def require_trust(judgement: Judgement, force: bool) -> None:
     """Raises `FitError` where a warning refuses the bore and `force` is not set.
 
-    Poses that blur the walls are named first: what is wrong with the bore follows from them.
+    A clock that is off is named first, else poses that blur the walls: what is wrong with the bore follows from them.
     """
     grave = [warning for warning in judgement.warnings if warning.refuses]
     if grave and not force:
-        poses = [f"{warning.text}; so " for warning in judgement.warnings if warning.code == Code.POSES]
-        raise FitError(f"{''.join(poses)}{grave[0].text}; --force builds it all the same", grave[0].code)
+        causes = [one for code in (Code.CLOCK, Code.POSES) for one in judgement.warnings if one.code == code]
+        cause = "".join(f"{one.text}; so " for one in causes[:1])
+        raise FitError(f"{cause}{grave[0].text}; --force builds it all the same", grave[0].code)

@@ -150,8 +150,8 @@ class Clock:
             return None
         side = "late" if self.offset > 0 else "early"
         return (
-            f"the clock of {self.of} is {abs(self.offset):.3f} s {side} against the LiDAR's, as the turns of both "
-            "show; --clock auto sets it right"
+            f"the clock of {self.of} is {abs(self.offset):.3f} s {side} against the LiDAR's, as the motion of both "
+            "shows; --clock auto sets it right"
         )
 
 

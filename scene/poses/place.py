@@ -16,12 +16,12 @@ from scene.cloud import Cloud
 from scene.errors import RecordingError
 from scene.inputs import hash_inputs
 from scene.poses.calibration import Calibration, Mount
-from scene.poses.clocks import settle
+from scene.poses.clocks import NOTICED, Clock, settle
 from scene.poses.consistency import check_poses, reorder
 from scene.poses.imu import Inertial, find_inertial, gyro_guide, level_rotation
 from scene.poses.odometry import LIBRARY, Guide, estimate_odometry
 from scene.poses.registration import register_scans
-from scene.poses.smoother import Noise, Problem, imu_steps, inertial_problem, solve_with_heading
+from scene.poses.smoother import Noise, Problem, find_control_lag, imu_steps, inertial_problem, solve_with_heading
 from scene.poses.terms import Chain
 from scene.poses.trajectory import MIN_CONTROL_SHARE, Control, Trajectory, load_control, load_tum
 from scene.progress import Stages
@@ -52,13 +52,13 @@ _GIVEN = {  # only their maker knows how well they fix the length
 
 def _find_timed(
     recording: Recording, calibration: Calibration, auto: bool
-) -> tuple[Inertial | None, Mount | None, dict[str, Any]]:
-    """Return the IMU with its mount, by the LiDAR's clock where `auto`, and the facts of its clock."""
+) -> tuple[Inertial | None, Mount | None, Clock | None]:
+    """Return the IMU with its mount, by the LiDAR's clock where `auto`, and what is known of its clock."""
     inertial, mount = find_inertial(recording, calibration)
     if inertial is None:
-        return None, None, {}
+        return None, None, None
     clock, timed = settle(recording, inertial, auto)
-    return timed if clock.corrected else inertial, mount, clock.facts
+    return timed if clock.corrected else inertial, mount, clock
 
 
 def locate_by_odometry(recording: Recording, calibration: Calibration, progress: Stages, auto: bool = False) -> Located:
@@ -78,7 +78,7 @@ def locate_by_odometry(recording: Recording, calibration: Calibration, progress:
         "length_fixed_by": f"odometry ({LIBRARY}); nothing measured the axial scale",
         "length_uncertainty": None,
         "length_uncertainty_from": "unknown: nobody measured the axial scale",
-        **clock,
+        **(clock.facts if clock else {}),
     }
     return Located(poses, facts)
 
@@ -106,14 +106,27 @@ def locate_by_control(
         raise RecordingError(f"{recording.path}: holds {len(times)} scans; at least 2 are needed")
     control.require_overlap(times[0], times[-1], recording.path)
     inertial, mount, clock = _find_timed(recording, calibration, auto)
-    if inertial is None or mount is None:
+    if inertial is None or mount is None or clock is None:
         raise RecordingError(
             f"{control.path}: control goes with an IMU whose mount is known, and {recording.path} has none; "
             "--calibration names it, or --trajectory gives whole poses"
         )
     if not inertial.force.any():
         raise RecordingError(f"{recording.path}: control needs gravity, and {inertial.topic} is without it")
-    problem, chain = _solve(recording, inertial, mount, control, calibration, progress)
+    lever = mount.rotation @ calibration.prism + mount.shift
+    problem, guess = _guess(progress, inertial, control, lever)
+    lag = find_control_lag(problem, guess, control)
+    corrected = auto and lag is not None and abs(lag) >= NOTICED
+    if corrected:
+        control = replace(control, times=control.times - lag)
+        problem, guess = _guess(progress, inertial, control, lever)
+    late = 0.0 if clock.corrected else clock.offset or 0.0  # of the IMU, against the LiDAR
+    of_control = Clock(f"the control {control.path.name}", None if lag is None else lag + late, corrected)
+    doubts = [words for words in (clock.words, of_control.words) if words]
+    stage = progress.start("LiDAR odometry", recording.scan_count)
+    odometry = estimate_odometry(recording, Guide(_lidar_poses(guess, mount), True, *_BY_CONTROL), stage)
+    problem = replace(problem, steps=imu_steps(odometry, guess, mount))
+    chain = _smooth(progress, lambda: problem.solve(guess)[0])
     return Located(
         _lidar_poses(chain, mount),
         {
@@ -121,7 +134,10 @@ def locate_by_control(
             "imu": inertial.topic,
             "calibration": calibration.name,
             "prism_lever": calibration.prism,
-            **clock,
+            **clock.facts,
+            "control_clock_offset": of_control.offset,
+            "control_clock_corrected": corrected,
+            "clock_doubt": "; ".join(doubts) or None,
             **_control_facts(problem, chain, control),
         },
         # Control often starts late and ends early; what it does not reach is left out, and counted.
@@ -129,21 +145,10 @@ def locate_by_control(
     )
 
 
-def _solve(
-    recording: Recording,
-    inertial: Inertial,
-    mount: Mount,
-    control: Control,
-    calibration: Calibration,
-    progress: Stages,
-) -> tuple[Problem, Chain]:
-    lever = mount.rotation @ calibration.prism + mount.shift
+def _guess(progress: Stages, inertial: Inertial, control: Control, lever: np.ndarray) -> tuple[Problem, Chain]:
+    """Return what IMU and control measured, and the trajectory of least cost by them alone."""
     problem, chain = inertial_problem(inertial, control, lever, Noise())
-    guess = _smooth(progress, lambda: solve_with_heading(problem, chain))
-    stage = progress.start("LiDAR odometry", recording.scan_count)
-    odometry = estimate_odometry(recording, Guide(_lidar_poses(guess, mount), True, *_BY_CONTROL), stage)
-    whole = replace(problem, steps=imu_steps(odometry, guess, mount))
-    return whole, _smooth(progress, lambda: whole.solve(guess)[0])
+    return problem, _smooth(progress, lambda: solve_with_heading(problem, chain))
 
 
 def _control_facts(problem: Problem, chain: Chain, control: Control) -> dict[str, Any]:
@@ -263,9 +268,15 @@ def _check_given(recording: Recording, given: Trajectory, reading: ReadingConfig
 
 
 def _check(recording: Recording, located: Located) -> Located:
-    """Return poses with what they make of the walls among their facts: rails hide where they blur them."""
+    """Return poses with what they make of the walls among their facts: rails hide where they blur them.
+
+    Another cause is not named where a clock is off.
+    """
     check = check_poses(recording, located.trajectory, False)
-    return located if check is None else replace(located, facts={**located.facts, **check.facts})
+    if check is None:
+        return located
+    check = replace(check, cause="two clocks differ") if located.facts["clock_doubt"] else check
+    return replace(located, facts={**located.facts, **check.facts})
 
 
 def place_cloud(path: Path, voxel: float, reading: ReadingConfig, progress: Stages) -> Placed:

@@ -1,11 +1,12 @@
 """The trajectory of least cost: IMU, odometry and control, on one chain of knots."""
 
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import make_smoothing_spline
 from scipy.ndimage import gaussian_filter1d
+from scipy.optimize import minimize_scalar
 
 from scene.errors import FitError, Refusal
 from scene.poses import terms
@@ -13,7 +14,7 @@ from scene.poses.calibration import Mount
 from scene.poses.imu import Inertial, integrals
 from scene.poses.odometry import Odometry
 from scene.poses.terms import Chain, Motion, Sightings, Steps
-from scene.poses.trajectory import Control
+from scene.poses.trajectory import MIN_CONTROL_ROWS, Control
 
 _YAWS = np.deg2rad(np.arange(0, 360, 45))
 _TRIAL = 60.0  # s of the recording on which the mounting's heading is tried out
@@ -107,6 +108,44 @@ def _first_knots(problem: Problem, chain: Chain, n: int) -> tuple[Problem, Chain
     )
     state = (chain.attitude, chain.position, chain.velocity, chain.gyro_bias, chain.accel_bias)
     return short, Chain(chain.times[:n], *(values[:n] for values in state))
+
+
+_LAG_TIME = 20.0  # s of the recording, about its middle, by which the lag of a control is found
+_LAG_STEP, _FARTHEST = 0.05, 1.5  # s: between lags that are tried, and the largest
+_LAG_ITERATIONS = 6  # Gauss-Newton steps for each
+_FITS = 2.0  # cost of a coordinate of a sighting, up to which the motion fits
+_NEAR, _TELLS = 0.01, 20.0  # s; by how much the cost must grow within it, or the motion does not tell
+
+
+def find_control_lag(problem: Problem, chain: Chain, control: Control) -> float | None:
+    """Return how much later the clock of a control is than the IMU's, s: then their motions fit best.
+
+    `chain` is the solution with the control as it is. `None` where the motion does not tell.
+    """
+    middle, half = len(chain.times) // 2, round(0.5 * _LAG_TIME / _KNOT_STEP)
+    part = slice(max(middle - half, 0), middle + half + 1)
+    short = Chain(*(values[part] for values in astuple(chain)))
+    between = slice(part.start, part.start + len(short.times) - 1)
+    motion = replace(problem.motion, rate=problem.motion.rate[between], force=problem.motion.force[between])
+    inside = np.abs(control.times - short.times[[0, -1]].mean()) < 0.5 * np.ptp(short.times) - _FARTHEST - 2 * _LAG_STEP
+    rows = replace(control, times=control.times[inside], positions=control.positions[inside])
+    if len(rows.times) < MIN_CONTROL_ROWS:
+        return None
+
+    def cost(lag: float) -> float:
+        late = replace(rows, times=rows.times - lag)
+        seen = make_sightings(late, short.times, problem.sightings.lever, problem.sightings.sigma)
+        return Problem(motion, seen, None, problem.noise).solve(short, _LAG_ITERATIONS)[1]
+
+    most, costs = _FITS * rows.positions.size, dict[float, float]()
+    for lag in sorted(np.arange(-_FARTHEST, _FARTHEST + 1e-9, _LAG_STEP), key=abs):
+        costs[lag] = cost(lag)
+        if costs[lag] < most:
+            break
+    near = min(costs, key=lambda lag: costs[lag])
+    best = minimize_scalar(cost, bounds=(near - _LAG_STEP, near + _LAG_STEP), options={"xatol": 1e-3})
+    around = min(cost(best.x - _NEAR), cost(best.x + _NEAR))
+    return float(best.x) if best.fun < most and around > best.fun + _TELLS else None
 
 
 _KNOT_STEP = 0.025  # s; between two knots a walker's motion is straight to 0.2 mm and 0.005°

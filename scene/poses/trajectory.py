@@ -106,7 +106,7 @@ def load_tum(path: Path) -> Trajectory:
     return Trajectory(rows[:, 0], rows[:, 1:4], Rotation.from_quat(rows[:, 4:]), str(path), order)
 
 
-_MIN_CONTROL_ROWS = 10  # of a control within the recording
+MIN_CONTROL_ROWS = 10  # of a control within the recording
 _MIN_CONTROL_EXTENT = 3.0  # m; less than a bore is wide, and no heading comes of it
 MIN_CONTROL_SHARE = 0.5  # of the recording's time
 
@@ -143,8 +143,8 @@ def load_control(path: Path) -> Control:
     if rows.size and rows.shape[1] not in (4, 8):
         raise RecordingError(f"{path}: control has rows of 4 or 8 numbers (t x y z, TUM), found {rows.shape[1]}")
     unique = rows[np.unique(rows[:, 0], return_index=True)[1]] if rows.size else rows
-    if len(unique) < _MIN_CONTROL_ROWS:
-        raise RecordingError(f"{path}: control needs {_MIN_CONTROL_ROWS} rows at different times, found {len(unique)}")
+    if len(unique) < MIN_CONTROL_ROWS:
+        raise RecordingError(f"{path}: control needs {MIN_CONTROL_ROWS} rows at different times, found {len(unique)}")
     extent = float(np.linalg.norm(np.ptp(unique[:, 1:4], axis=0)))
     if extent < _MIN_CONTROL_EXTENT:
         raise RecordingError(
