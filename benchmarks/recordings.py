@@ -228,8 +228,8 @@ def time_error(drive: Drive, case: Case, recording: Recording, late: float) -> f
             there = np.minimum(first + k_th, last - 1)
             late_by = np.minimum(late_by, np.abs(scans[k].stamp + scans[k].times - late - at[there]))
         off.append(late_by)
-    # a bad time may look like one of the sweep
-    return float(np.quantile(np.concatenate(off), 1.0 - convention.bad_times))
+    # a bad time may look like one of the sweep, and the sweeps that are compared may have more of them than most
+    return float(np.quantile(np.concatenate(off), 1.0 - 2.0 * convention.bad_times))
 
 
 def _keys(points: np.ndarray) -> UInt64[np.ndarray, " n"]:

@@ -6,7 +6,6 @@ import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import make_smoothing_spline
 from scipy.ndimage import gaussian_filter1d
-from scipy.optimize import minimize_scalar
 
 from scene.errors import FitError, Refusal
 from scene.poses import terms
@@ -113,8 +112,9 @@ def _first_knots(problem: Problem, chain: Chain, n: int) -> tuple[Problem, Chain
 _LAG_TIME = 20.0  # s of the recording, about its middle, by which the lag of a control is found
 _LAG_STEP, _FARTHEST = 0.05, 1.5  # s: between lags that are tried, and the largest
 _LAG_ITERATIONS = 6  # Gauss-Newton steps for each
-_FITS = 2.0  # cost of a coordinate of a sighting, up to which the motion fits
-_NEAR, _TELLS = 0.01, 20.0  # s; by how much the cost must grow within it, or the motion does not tell
+_REFINED = (0.03, 0.01)  # s; between lags about the best of these
+_TELLS = 18.0  # least bend of the cost about it over the last of these, by which it is known to 3 ms
+_FITS = 2.0  # largest cost of a coordinate of a sighting that fits the motion
 
 
 def find_control_lag(problem: Problem, chain: Chain, control: Control) -> float | None:
@@ -137,15 +137,19 @@ def find_control_lag(problem: Problem, chain: Chain, control: Control) -> float 
         seen = make_sightings(late, short.times, problem.sightings.lever, problem.sightings.sigma)
         return Problem(motion, seen, None, problem.noise).solve(short, _LAG_ITERATIONS)[1]
 
-    most, costs = _FITS * rows.positions.size, dict[float, float]()
+    count, costs = rows.positions.size, dict[float, float]()
     for lag in sorted(np.arange(-_FARTHEST, _FARTHEST + 1e-9, _LAG_STEP), key=abs):
         costs[lag] = cost(lag)
-        if costs[lag] < most:
+        if costs[lag] < count:
             break
-    near = min(costs, key=lambda lag: costs[lag])
-    best = minimize_scalar(cost, bounds=(near - _LAG_STEP, near + _LAG_STEP), options={"xatol": 1e-3})
-    around = min(cost(best.x - _NEAR), cost(best.x + _NEAR))
-    return float(best.x) if best.fun < most and around > best.fun + _TELLS else None
+    best = min(costs, key=lambda lag: costs[lag])
+    for step in _REFINED:  # parabolas through three lags
+        before, here, after = (cost(best + side) for side in (-step, 0.0, step))
+        bend = before - 2.0 * here + after
+        if bend < _TELLS:
+            return None
+        best += float(np.clip(0.5 * step * (before - after) / bend, -_LAG_STEP, _LAG_STEP))
+    return best if here < _FITS * count else None
 
 
 _KNOT_STEP = 0.025  # s; between two knots a walker's motion is straight to 0.2 mm and 0.005°

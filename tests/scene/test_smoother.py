@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +11,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from scene.errors import FitError, Refusal
-from scene.poses.imu import integrals
-from scene.poses.smoother import Noise, inertial_problem, means_between, solve_with_heading
+from scene.poses.imu import GRAVITY, Inertial, integrals
+from scene.poses.smoother import Noise, find_control_lag, inertial_problem, means_between, solve_with_heading
 from scene.poses.terms import KNOT_SIZE, Chain, Motion, NormalEquations, Sightings, Steps, add_motion
+from scene.poses.trajectory import Control
 from tests.scene import walks
 
 DURATION = 24.0
@@ -34,6 +36,23 @@ def test_prism_and_imu_give_place_and_attitude_however_the_imu_is_mounted(mounte
     assert np.sqrt(np.mean(twist**2, axis=0)).max() < 0.3
     assert np.sqrt(np.mean(off**2)) < 0.003
     np.testing.assert_allclose(chain.gyro_bias[-1], 0.003, atol=1e-3)
+
+
+@pytest.mark.parametrize("late", [0.0, 0.014, -0.1, 0.7])
+def test_the_clock_of_a_control_is_told_by_the_motion_that_it_shares_with_the_imu(late):
+    control = walks.control(DURATION)
+    control = replace(control, times=control.times + late)
+    problem, guess = inertial_problem(walks.inertial(DURATION), control, walks.LEVER, Noise())
+    assert find_control_lag(problem, solve_with_heading(problem, guess), control) == pytest.approx(late, abs=0.004)
+
+
+def test_a_carrier_that_glides_tells_no_clock():
+    times = np.arange(0.0, DURATION, 0.005)
+    even = np.column_stack([1.0 * times, 0.0 * times, 0.0 * times])
+    inertial = Inertial(times, 0.0 * even, np.tile([0.0, 0.0, GRAVITY], (len(times), 1)), "/imu")
+    control = Control(times[40:-40:66], even[40:-40:66] + walks.LEVER, Path("prism.tum"), 0)
+    problem, guess = inertial_problem(inertial, control, walks.LEVER, Noise())
+    assert find_control_lag(problem, solve_with_heading(problem, guess), control) is None
 
 
 def test_a_control_row_that_is_wrong_by_a_metre_moves_the_trajectory_by_millimetres():
