@@ -38,12 +38,12 @@ def test_prism_and_imu_give_place_and_attitude_however_the_imu_is_mounted(mounte
     np.testing.assert_allclose(chain.gyro_bias[-1], 0.003, atol=1e-3)
 
 
-@pytest.mark.parametrize("late", [0.0, 0.014, -0.1, 0.7])
+@pytest.mark.parametrize("late", [0.014, -0.1])
 def test_the_clock_of_a_control_is_told_by_the_motion_that_it_shares_with_the_imu(late):
     control = walks.control(DURATION)
     control = replace(control, times=control.times + late)
     problem, guess = inertial_problem(walks.inertial(DURATION), control, walks.LEVER, Noise())
-    assert find_control_lag(problem, solve_with_heading(problem, guess), control) == pytest.approx(late, abs=0.004)
+    assert find_control_lag(problem, problem.solve(guess)[0], control) == pytest.approx(late, abs=0.002)
 
 
 def test_a_carrier_that_glides_tells_no_clock():
@@ -52,7 +52,7 @@ def test_a_carrier_that_glides_tells_no_clock():
     inertial = Inertial(times, 0.0 * even, np.tile([0.0, 0.0, GRAVITY], (len(times), 1)), "/imu")
     control = Control(times[40:-40:66], even[40:-40:66] + walks.LEVER, Path("prism.tum"), 0)
     problem, guess = inertial_problem(inertial, control, walks.LEVER, Noise())
-    assert find_control_lag(problem, solve_with_heading(problem, guess), control) is None
+    assert find_control_lag(problem, problem.solve(guess)[0], control) is None
 
 
 def test_a_control_row_that_is_wrong_by_a_metre_moves_the_trajectory_by_millimetres():
