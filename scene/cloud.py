@@ -1,6 +1,6 @@
 """The registered cloud: points in one frame, thinned to one weighted point per voxel."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -20,19 +20,17 @@ class Cloud:
     origin: Float[np.ndarray, "3"]  # Whole-metre offset of the tunnel frame in the input's frame, m
     returns: int  # Returns read in all
     voxel: float  # Edge length of the voxels, m
+    # Mean intensity of each point's returns, as the sensor scales it; `None` where the input tells none
+    intensity: Float[np.ndarray, " n"] | None = None
 
 
-def thin_cloud(cloud: Cloud, voxel: float) -> Float[np.ndarray, "k 3"]:
-    """Return the cloud's points in the tunnel frame, one mean a voxel, m."""
-    return thin_and_count(cloud, voxel)[0]
-
-
-def thin_and_count(cloud: Cloud, voxel: float) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, " k"]]:
-    """Return the cloud's points in the tunnel frame, one mean a voxel, m, and the number of points in each voxel."""
+def thin_cloud(cloud: Cloud, voxel: float) -> Cloud:
+    """Return the means of a cloud's points by larger voxels, m, in the same frame; they are weighted by points."""
     again = VoxelMean(voxel)
-    again.add(cloud.points.astype(np.float64))
+    points = cloud.points.astype(np.float64)
+    again.add(points if cloud.intensity is None else np.column_stack([points, cloud.intensity]))
     coarse = again.cloud()
-    return (coarse.points + coarse.origin).astype(np.float32), coarse.weights
+    return replace(coarse, points=(coarse.points + coarse.origin).astype(np.float32), origin=cloud.origin)
 
 
 class VoxelMean:
@@ -51,20 +49,21 @@ class VoxelMean:
         self._parts: list[tuple[np.ndarray, np.ndarray]] = []
         self._pending = 0
 
-    def add(self, points: Float[np.ndarray, "n 3"]) -> None:
-        """Adds points in the fixed frame, m; those not finite are dropped."""
-        points = points[np.isfinite(points).all(axis=1)]
+    def add(self, points: Float[np.ndarray, "n k"]) -> None:
+        """Adds points in the fixed frame, m, less those not finite; a fourth column is their intensity."""
+        points = points[np.isfinite(points[:, :3]).all(axis=1)]
         self.finite += len(points)
         if not len(points):
             return
         if self._origin is None:
-            self._origin = np.floor(np.median(points, axis=0))
-        local = points - self._origin
+            self._origin = np.floor(np.median(points[:, :3], axis=0))
+        local = points[:, :3] - self._origin
         inside = (np.abs(local) < (_HALF - 1) * self.voxel).all(axis=1)
         local = local[inside]
+        intensity = points[inside, 3:4] if points.shape[1] > 3 else np.full((len(local), 1), np.nan)
         cell = np.floor(local / self.voxel).astype(np.int64)
         key = ((cell[:, 0] + _HALF) << 2 * _BITS) | ((cell[:, 1] + _HALF) << _BITS) | (cell[:, 2] + _HALF)
-        sums = np.concatenate([local, np.ones((len(local), 1))], axis=1)
+        sums = np.concatenate([local, np.ones((len(local), 1)), intensity], axis=1)
         self._parts.append(_merge_cells(key, sums))
         self._pending += len(self._parts[-1][0])
         if self._pending > _MERGE_AT:
@@ -78,7 +77,8 @@ class VoxelMean:
         sums = self._parts[0][1]
         weights = sums[:, 3]
         points = (sums[:, :3] / weights[:, None]).astype(np.float32)
-        return Cloud(points, weights.astype(np.float32), self._origin, self.returns, self.voxel)
+        intensity = None if np.isnan(sums[:, 4]).all() else (sums[:, 4] / weights).astype(np.float32)
+        return Cloud(points, weights.astype(np.float32), self._origin, self.returns, self.voxel, intensity)
 
     def _compact(self) -> None:
         if len(self._parts) > 1:

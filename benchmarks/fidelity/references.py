@@ -14,7 +14,7 @@ from benchmarks.fidelity.files import FidelityError, file_hash
 from scene.poses.trajectory import load_tum
 from scene.reading.recording import Recording
 from scene.reading.scans import POINTCLOUD2_TYPE, cloud_records
-from scene.reading.source import stack_xyz
+from scene.reading.source import stack_points
 from scene.reading.times import Scan, make_scan, time_field
 
 SILENT_RANGE = 1e6  # m: where the point of a beam without return is put, in its direction
@@ -98,7 +98,7 @@ def _read_fields(message: Any) -> tuple[Float[np.ndarray, "rings columns 3"], In
     if name is None:
         raise ValueError("a sweep whose points have no times")
     shape = (message.height, message.width)
-    return stack_xyz(rows).reshape(*shape, 3), rows[name].reshape(shape), name
+    return stack_points(rows)[:, :3].reshape(*shape, 3), rows[name].reshape(shape), name
 
 
 def _wrap(angle: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:

@@ -17,7 +17,7 @@ from scene.cleaning import sort
 from scene.cleaning.follow import N_RAYS, Course, Seed, find_seeds, follow_bore, join_courses
 from scene.cleaning.sort import Cleaned, look_around, part_of_cloud, sort_points
 from scene.cleaning.tube import Tube, find_plane_walls, measure_tube
-from scene.cloud import Cloud, thin_and_count
+from scene.cloud import Cloud, thin_cloud
 from scene.errors import Cause, FitError, Refusal
 from scene.fitting.assemble import CentrelineConfig, centre_axis, smooth_axis
 from scene.geometry import Axis, bin_angles
@@ -90,8 +90,8 @@ def clean_cloud(cloud: Cloud, centreline: CentrelineConfig) -> Cleaned:
     Raises `FitError` where no bore can be seen, naming the cause.
     """
     supported = sort.has_support(cloud.points)
-    thinned, count = thin_and_count(part_of_cloud(cloud, np.flatnonzero(supported)), _COARSE)
-    coarse = thinned.astype(np.float64)
+    thinned = thin_cloud(part_of_cloud(cloud, np.flatnonzero(supported)), _COARSE)
+    coarse, count = thinned.points.astype(np.float64), thinned.weights
     if len(coarse) < _FEWEST:
         why = f"no tunnel in the cloud: it holds {len(coarse)} places of {_COARSE:g} m; {_FEWEST} are needed"
         raise FitError(why, Refusal.NO_BORE)

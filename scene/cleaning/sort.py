@@ -240,7 +240,8 @@ class Cleaned:
 
 def part_of_cloud(cloud: Cloud, rows: Int[np.ndarray, " k"]) -> Cloud:
     """Return some of a cloud's points; the number of returns read stays what it was."""
-    return replace(cloud, points=cloud.points[rows], weights=cloud.weights[rows])
+    intensity = None if cloud.intensity is None else cloud.intensity[rows]
+    return replace(cloud, points=cloud.points[rows], weights=cloud.weights[rows], intensity=intensity)
 
 
 def list_removed(

@@ -47,7 +47,7 @@ def keep_placed(path: Path, placed: Placed) -> None:
         np.savez(
             file, facts=json.dumps(facts, default=lambda value: value.tolist()), points=cloud.points,
             weights=cloud.weights, origin=cloud.origin, low=placed.low, times=poses.times, positions=poses.positions,
-            rotations=poses.rotations.as_quat(),
+            rotations=poses.rotations.as_quat(), **({} if cloud.intensity is None else {"intensity": cloud.intensity}),
         )  # fmt: skip
 
 
@@ -59,7 +59,8 @@ def load_kept(path: Path) -> Placed | None:
         facts = json.loads(str(data["facts"]))
         rotations = Rotation.from_quat(data["rotations"])
         poses = Trajectory(data["times"], data["positions"], rotations, facts["source"])
-        cloud = Cloud(data["points"], data["weights"], data["origin"], facts["returns"], facts["voxel"])
+        intensity = data.get("intensity")
+        cloud = Cloud(data["points"], data["weights"], data["origin"], facts["returns"], facts["voxel"], intensity)
         located = Located(poses, facts["located"], facts["estimated"], facts["uncovered"])
         low = data["low"]
     print(f"poses and cloud: those of a build that did not end ({path})", flush=True)

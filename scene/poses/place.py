@@ -116,7 +116,7 @@ def locate_by_control(
     lever = mount.rotation @ calibration.prism + mount.shift
     problem, guess = _guess(progress, inertial, control, lever)
     lag = find_control_lag(problem, guess, control)
-    corrected = auto and lag is not None and abs(lag) >= NOTICED
+    corrected = bool(auto and lag is not None and abs(lag) >= NOTICED)
     if corrected:
         control = replace(control, times=control.times - lag)
         problem, guess = _guess(progress, inertial, control, lever)

@@ -59,10 +59,11 @@ def register_scans(
         if not trajectory.covers(scan.stamp, scan.end):
             uncovered += 1
             continue
-        batch.append(deskew(scan, trajectory))
+        points = deskew(scan, trajectory)
+        batch.append(np.column_stack([points, np.nan * scan.times if scan.intensity is None else scan.intensity]))
         placed += 1
         if placed % every == 0:
-            low.append(_low_returns(scan, batch[-1], trajectory))
+            low.append(_low_returns(scan, points, trajectory))
         if len(batch) == _BATCH:
             thinned.add(np.concatenate(batch))
             if placed == _BATCH:

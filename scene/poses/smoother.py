@@ -112,7 +112,7 @@ def _first_knots(problem: Problem, chain: Chain, n: int) -> tuple[Problem, Chain
 _LAG_TIME = 20.0  # s of the recording, about its middle, by which the lag of a control is found
 _LAG_STEP, _FARTHEST = 0.05, 1.5  # s: between lags that are tried, and the largest
 _LAG_ITERATIONS = 6  # Gauss-Newton steps for each
-_REFINED = (0.03, 0.01)  # s; between lags about the best of these
+_REFINED = (0.03, 0.02, 0.01, 0.01)  # s; between lags about the best of these
 _TELLS = 18.0  # least bend of the cost about it over the last of these, by which it is known to 3 ms
 _FITS = 2.0  # largest cost of a coordinate of a sighting that fits the motion
 
@@ -132,24 +132,24 @@ def find_control_lag(problem: Problem, chain: Chain, control: Control) -> float 
     if len(rows.times) < MIN_CONTROL_ROWS:
         return None
 
-    def cost(lag: float) -> float:
+    def solve(lag: float, chain: Chain, iterations: int = _LAG_ITERATIONS) -> tuple[Chain, float]:
         late = replace(rows, times=rows.times - lag)
-        seen = make_sightings(late, short.times, problem.sightings.lever, problem.sightings.sigma)
-        return Problem(motion, seen, None, problem.noise).solve(short, _LAG_ITERATIONS)[1]
+        seen = make_sightings(late, chain.times, problem.sightings.lever, problem.sightings.sigma)
+        return Problem(motion, seen, None, problem.noise).solve(chain, iterations)
 
-    count, costs = rows.positions.size, dict[float, float]()
+    most, costs = _FITS * rows.positions.size, dict[float, float]()
     for lag in sorted(np.arange(-_FARTHEST, _FARTHEST + 1e-9, _LAG_STEP), key=abs):
-        costs[lag] = cost(lag)
-        if costs[lag] < count:
+        costs[lag] = solve(lag, short)[1]
+        if costs[lag] < most:
             break
     best = min(costs, key=lambda lag: costs[lag])
-    for step in _REFINED:  # parabolas through three lags
-        before, here, after = (cost(best + side) for side in (-step, 0.0, step))
+    for step in _REFINED:  # parabolas through three lags, about a solution that remembers no other lag
+        short, here = solve(best, short, _ITERATIONS)
+        before, after = (solve(best + side, short, _ITERATIONS)[1] for side in (-step, step))
         bend = before - 2.0 * here + after
-        if bend < _TELLS:
-            return None
-        best += float(np.clip(0.5 * step * (before - after) / bend, -_LAG_STEP, _LAG_STEP))
-    return best if here < _FITS * count else None
+        within = here <= min(before, after) and bend > _TELLS
+        best += float(0.5 * step * (before - after) / bend if within else step * np.sign(before - after))
+    return best if here < most and within else None
 
 
 _KNOT_STEP = 0.025  # s; between two knots a walker's motion is straight to 0.2 mm and 0.005°

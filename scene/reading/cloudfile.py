@@ -63,6 +63,7 @@ def _crs_beside(path: Path) -> str | None:
 def _frame_of(path: Path, source: CloudSource, config: ReadingConfig) -> Frame:
     """Chooses unit and axes of a cloud; raises `RecordingError` for a flag or declaration that is none."""
     local = next(source.chunks(), None) if config.unit is None and needs_local_points(source) else None
+    local = None if local is None else local[:, :3]
     whole = source.sample if len(source.sample) or local is None else local
     try:
         return choose_frame(whole, source.unit, config.unit, config.axes, local)
@@ -82,7 +83,7 @@ def _thin(source: CloudSource, frame: Frame, voxel: float, stage: Stage | None) 
     for chunk in source.chunks():
         read += len(chunk)
         thinned.add(placed := frame.apply(chunk))
-        rounding = max(measure_rounding(placed)) if rounding is None else rounding
+        rounding = max(measure_rounding(placed[:, :3])) if rounding is None else rounding
         if stage is not None:
             stage.advance(len(chunk))
     return thinned, read, rounding or 0.0

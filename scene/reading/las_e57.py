@@ -128,7 +128,7 @@ def open_las(path: Path, keep_noise: bool = False) -> CloudSource:
         # The parallel decoder believes every size in the chunk table, and a wrong one ends the process.
         with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs) as reader:
             for points in reader.chunk_iterator(BATCH):
-                xyz = np.stack([np.asarray(points.x), np.asarray(points.y), np.asarray(points.z)], axis=1)
+                xyz = np.column_stack([points.x, points.y, points.z, points.intensity])
                 read += len(points)
                 if not keep_noise:
                     withheld = np.asarray(points.withheld).astype(bool)

@@ -19,7 +19,7 @@ from jaxtyping import Shaped
 
 from scene.errors import RecordingError
 from scene.reading.ply_pcd import read_pcd_records, read_ply_records
-from scene.reading.source import cause, stack_xyz
+from scene.reading.source import INTENSITIES, cause, stack_points
 from scene.reading.times import RawScan, make_scan, seconds_in, time_field
 
 
@@ -79,8 +79,10 @@ def scan_from_records(stamp: float, records: Shaped[np.ndarray, " n"]) -> RawSca
     Raises `ValueError` where a coordinate is missing.
     """
     name, unit = time_field(records.dtype.names or ())
-    points = stack_xyz(records).astype(np.float32)
-    return replace(make_scan(stamp, points, None if name is None else records[name], name or ""), unit=unit)
+    points = stack_points(records).astype(np.float32)
+    intensity = points[:, 3] if points.shape[1] > 3 else None
+    scan = make_scan(stamp, points[:, :3], None if name is None else records[name], name or "", intensity)
+    return replace(scan, unit=unit)
 
 
 LIVOX_TYPES = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
@@ -121,7 +123,8 @@ def parse_custom_msg(raw: bytes, cdr: bool = False) -> RawScan:
 def _livox_scan(stamp: float, points: np.ndarray) -> RawScan:
     points = points[points["tag"] & _TAG_RETURN_MASK == 0]
     xyz = np.stack([points["x"], points["y"], points["z"]], axis=1)
-    return replace(make_scan(stamp, xyz, points["offset_time"], "offset_time"), unit="ns")
+    scan = make_scan(stamp, xyz, points["offset_time"], "offset_time", points["reflectivity"])
+    return replace(scan, unit="ns")
 
 
 POINTCLOUD2_TYPE = "sensor_msgs/msg/PointCloud2"
@@ -157,7 +160,7 @@ def cloud_records(message: Any) -> Shaped[np.ndarray, " n"]:
 def _record_layout(message: Any, step: int) -> np.dtype:
     order = ">" if message.is_bigendian else "<"
     names = [field.name for field in message.fields]
-    needed = {time_field(names)[0], *(name for name in names if name.lower() in ("x", "y", "z"))}
+    needed = {time_field(names)[0], *(name for name in names if name.lower() in ("x", "y", "z", *INTENSITIES))}
     fields: dict[str, tuple[str, int]] = {}
     for field in message.fields:
         if field.name in needed and field.name not in fields:

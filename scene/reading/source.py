@@ -49,8 +49,8 @@ class CloudSource:
     """A cloud that has been opened but not read."""
 
     format: str  # With its version, for the manifest
-    # Starts reading: x, y, z as stored, `(n, 3)` float64 each, of bounded size
-    chunks: Callable[[], Iterator[Float[np.ndarray, "n 3"]]]
+    # Starts reading: x, y, z as stored, float64, of bounded size; a fourth column is the intensity
+    chunks: Callable[[], Iterator[Float[np.ndarray, "n k"]]]
     # Points from all over the file, or corners of its box, by which a unit is found
     sample: Float[np.ndarray, "k 3"]
     unit: str | None = None  # `m`, `mm` or a kind of foot, where the format or a header says so
@@ -60,17 +60,20 @@ class CloudSource:
     left_out: Counter[str] = field(default_factory=Counter)
 
 
-def find_xyz_names(names: Sequence[str]) -> list[str]:
-    """Return the names of x, y and z, in whatever case; raises `ValueError` where one is missing."""
+INTENSITIES = ("intensity", "reflectivity", "reflectance", "scalar_intensity")  # names of one field
+
+
+def find_names(names: Sequence[str]) -> list[str]:
+    """Return the names of x, y, z and any intensity, in whatever case; raises `ValueError` without one of xyz."""
     known = {name.lower(): name for name in reversed(names)}
     if missing := [name for name in "xyz" if name not in known]:
         raise ValueError(f"it has no field {', '.join(missing)}")
-    return [known[name] for name in "xyz"]
+    return [known[name] for name in "xyz"] + [known[name] for name in INTENSITIES if name in known][:1]
 
 
-def stack_xyz(records: np.ndarray) -> Float[np.ndarray, "n 3"]:
-    """Return x, y and z of structured records as float64; raises `ValueError` where one is missing."""
-    names = find_xyz_names(records.dtype.names or ())
+def stack_points(records: np.ndarray) -> Float[np.ndarray, "n k"]:
+    """Return x, y, z and any intensity of records as float64; raises `ValueError` where a coordinate is missing."""
+    names = find_names(records.dtype.names or ())
     with np.errstate(invalid="ignore"):  # bit patterns that are no number; they are dropped later
         return np.stack([records[name] for name in names], axis=1).astype(np.float64)
 
@@ -80,9 +83,10 @@ def source_from_records(format: str, records: np.ndarray) -> CloudSource:
 
     def chunks() -> Iterator[np.ndarray]:
         for start in range(0, len(records), BATCH):
-            yield stack_xyz(records[start : start + BATCH])
+            yield stack_points(records[start : start + BATCH])
 
-    return CloudSource(format, chunks, stack_xyz(records[:: max(len(records) // 2000, 1)]), count=len(records))
+    sample = stack_points(records[:: max(len(records) // 2000, 1)])[:, :3]
+    return CloudSource(format, chunks, sample, count=len(records))
 
 
 _TEXT_BLOCK = 1 << 22  # bytes
@@ -156,9 +160,9 @@ class Lines:
 
 def source_from_text(format: str, path: Path, names: list[str], start: int, line: int, count: int) -> CloudSource:
     """Return a source over `count` lines with a number for each of `names`, from a byte on; `line` is its number."""
-    text = Lines(path, tuple(names.index(name) for name in find_xyz_names(names)), start=start, line=line, count=count)
+    text = Lines(path, tuple(names.index(name) for name in find_names(names)), start=start, line=line, count=count)
     none = np.empty((0, 3))
-    return CloudSource(format, text.rows, next(text.rows(), none) if count else none)
+    return CloudSource(format, text.rows, next(text.rows(), none)[:, :3] if count else none)
 
 
 # Metres of each. Source: NIST SP 811, B.6: the international foot, and the US survey foot of 1200/3937 m.
@@ -183,10 +187,10 @@ class Frame:
     axes: str  # Stored axes that point along x, y and z
     facts: dict[str, str]  # Both, and how each was found, for people and the manifest
 
-    def apply(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Return stored coordinates in m, z up."""
+    def apply(self, points: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
+        """Return stored coordinates in m, z up; further columns stay as they are."""
         order, signs = _parse_axes(self.axes)
-        return points[:, order] * (signs * UNITS[self.unit])
+        return np.hstack([points[:, order] * (signs * UNITS[self.unit]), points[:, 3:]])
 
 
 def needs_local_points(source: CloudSource) -> bool:

@@ -69,6 +69,7 @@ class Scan:
     stamp: float  # Time of the sweep, s
     points: Float[np.ndarray, "n 3"]  # Returns at their own time, m
     times: Float[np.ndarray, " n"]  # Time of each return after `stamp`, s
+    intensity: Float[np.ndarray, " n"] | None = None  # As the sensor scales it; `None` where it tells none
 
     def pick(self, count: int, rows: Int[np.ndarray, " k"] | None = None) -> "Scan":
         """Return at most `count` returns of all, or of some rows, evenly spread over them."""
@@ -92,10 +93,15 @@ class RawScan:
     name: str = ""  # Field of the times
     unit: str | None = None  # Their unit, where the format says so
     received: float = np.nan  # When it was recorded, s; NaN where nobody knows
+    intensity: Shaped[np.ndarray, " n"] | None = None  # As the sensor scales it; `None` where it tells none
 
 
 def make_scan(
-    stamp: float, points: Float[np.ndarray, "n 3"], values: Shaped[np.ndarray, " n"] | None, name: str = ""
+    stamp: float,
+    points: Float[np.ndarray, "n 3"],
+    values: Shaped[np.ndarray, " n"] | None,
+    name: str = "",
+    intensity: Shaped[np.ndarray, " n"] | None = None,
 ) -> RawScan:
     """Return a sweep as a reader has it, less points at the origin (nothing came back), not finite or absurdly far.
 
@@ -104,9 +110,11 @@ def make_scan(
         points: Points in the sensor frame, m.
         values: Point times as stored, in whatever unit; `None` where there are none.
         name: Name of their field.
+        intensity: Intensity of each; `None` where there is none.
     """
     good = (np.abs(points) < _FARTHEST).all(axis=1) & (points != 0).any(axis=1)
-    return RawScan(stamp, points[good], None if values is None else values[good], name)
+    values, intensity = (None if column is None else column[good] for column in (values, intensity))
+    return RawScan(stamp, points[good], values, name, intensity=intensity)
 
 
 @dataclass(frozen=True)
@@ -130,17 +138,18 @@ class Convention:
         """Return the sweep with its returns in the order of time, and the number left out for want of a time."""
         stamp = raw.received if self.by_receipt else raw.stamp
         if raw.values is None or self.kind == "static":
-            return Scan(stamp, raw.points, np.zeros(len(raw.points))), 0
+            return Scan(stamp, raw.points, np.zeros(len(raw.points)), raw.intensity), 0
         values, good = _unwrap(raw.values)
         if not good.any():
             return Scan(stamp, raw.points[:0], np.zeros(0)), len(good)
         good &= np.abs(values - np.median(values[good])) * self.scale <= _WIDE * self.reach
-        points, values = raw.points[good], values[good]
-        start, times = self._place(stamp, values * self.scale)
+        start, times = self._place(stamp, values[good] * self.scale)
+        rows = np.flatnonzero(good)
         if (np.diff(times) < 0).any():
             order = np.argsort(times, kind="stable")
-            points, times = points[order], times[order]
-        return Scan(start, points, times), int((~good).sum())
+            rows, times = rows[order], times[order]
+        intensity = None if raw.intensity is None else raw.intensity[rows]
+        return Scan(start, raw.points[rows], times, intensity), int((~good).sum())
 
     def _place(self, stamp: float, times: Float[np.ndarray, " n"]) -> tuple[float, Float[np.ndarray, " n"]]:
         """Return the time from which a sweep is counted, and times after it, s."""
@@ -161,7 +170,9 @@ def join_scans(parts: list[Scan]) -> Scan:
     if len(parts) == 1:
         return parts[0]
     times = np.concatenate([part.times + (part.stamp - parts[0].stamp) for part in parts])
-    return Scan(parts[0].stamp, np.concatenate([part.points for part in parts]), times)
+    brightness = [part.intensity for part in parts if part.intensity is not None]
+    intensity = np.concatenate(brightness) if len(brightness) == len(parts) else None
+    return Scan(parts[0].stamp, np.concatenate([part.points for part in parts]), times, intensity)
 
 
 def _unwrap(values: Shaped[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:

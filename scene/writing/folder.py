@@ -70,7 +70,11 @@ def write_folder(
     (folder / "build.html").write_text(render_page(name, result.bore, judgement, content), encoding="utf-8")
     write_manifest(folder / "manifest.json", content, config)
     if result.cloud is not None:
-        trimesh.PointCloud(thin_cloud(result.cloud, _PREVIEW_VOXEL)).export(folder / "cloud.ply")
+        thinned = thin_cloud(result.cloud, _PREVIEW_VOXEL)
+        preview = trimesh.PointCloud(thinned.points)
+        if thinned.intensity is not None:
+            preview.vertex_attributes = {"intensity": thinned.intensity}
+        preview.export(folder / "cloud.ply")
         if crs:
             _comment(folder / "cloud.ply", f"crs {crs}")
     if result.odometry is not None:

@@ -8,15 +8,25 @@ from pathlib import Path
 import laspy
 import numpy as np
 import pytest
+import trimesh
+from pypcd4 import PointCloud
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
-from scene.cloud import VoxelMean
+from scene.cleaning.sort import part_of_cloud
+from scene.cloud import VoxelMean, thin_cloud
 from scene.errors import RecordingError
+from scene.poses.registration import register_scans
+from scene.poses.trajectory import Trajectory
+from scene.progress import Stages
 from scene.reading.cloudfile import read_cloud
 from scene.reading.formats import ReadingConfig
+from scene.reading.recording import Recording
 from scene.reading.source import choose_frame
 from scene.reading.tables import find_xyz, plain_name
 from tests.scene.clouds import curved_d_bore
 from tests.scene.files import CLOUDS, write_e57, write_las, write_text, write_xlsx
+from tests.scene.messages import VELODYNE, pointcloud2, write_bag1
 
 
 def test_a_voxel_keeps_the_mean_and_the_number_of_its_points():
@@ -284,3 +294,51 @@ def test_coordinates_rounded_to_centimetres_are_told_and_those_rounded_to_half_a
     assert read_cloud(tmp_path / "0.05.xyz", 0.04)[1]["rounded_to"] == pytest.approx(0.05, abs=1e-6)
     with pytest.raises(RecordingError, match=r"rounded to 0\.5 m"):
         read_cloud(tmp_path / "0.5.xyz", 0.04)
+
+
+BRIGHT = {"intensity": np.linspace(10, 200, 300).astype(np.float32)}
+XYZ = np.random.default_rng(8).uniform(-9, 9, (300, 3)).astype(np.float32)
+
+
+def bright_ply(path):
+    cloud = trimesh.PointCloud(XYZ)
+    cloud.vertex_attributes = BRIGHT
+    cloud.export(path)
+
+
+def bright_pcd(path):
+    fields = ("x", "y", "z", "intensity")
+    PointCloud.from_points(np.column_stack([XYZ, BRIGHT["intensity"]]), fields, (np.float32,) * 4).save(path)
+
+
+def bright_las(path):
+    las = laspy.LasData(laspy.LasHeader(point_format=3, version="1.2"))
+    las.x, las.y, las.z, las.intensity = *XYZ.T, BRIGHT["intensity"].astype(np.uint16)
+    las.write(str(path))
+
+
+def bright_bag(path):
+    columns = dict(zip("xyz", XYZ.T, strict=True)) | BRIGHT | {"ring": 0, "time": np.linspace(0, 0.1, 300)[::-1]}
+    write_bag1(path, {"/points": [(1.0 + k, pointcloud2(1.0 + k, VELODYNE, 22, columns)) for k in (0.0, 0.1)]})
+
+
+@pytest.mark.parametrize(("name", "write"), [("a.ply", bright_ply), ("a.pcd", bright_pcd), ("a.las", bright_las)])
+def test_the_intensity_of_a_point_stays_with_it(tmp_path, name, write):
+    write(tmp_path / name)
+    assert_bright(read_cloud(tmp_path / name, 0.001)[0], 1.0)
+
+
+def test_the_intensity_of_a_return_stays_with_it(tmp_path):
+    bright_bag(tmp_path / "a.bag")
+    still = Trajectory(np.array([0.0, 9.0]), np.zeros((2, 3)), Rotation.identity(2), "still")
+    with Stages() as stages, Recording(tmp_path / "a.bag") as recording:
+        stage = stages.start("registering", 2)
+        assert_bright(register_scans(recording, still, 0.001, stage).cloud, 1e-3)
+
+
+def assert_bright(cloud, off: float) -> None:
+    """The cleaned and thinned cloud has the intensity of the point that lies there."""
+    picked = part_of_cloud(cloud, np.arange(0, len(cloud.points), 2))
+    thinned = thin_cloud(picked, 0.002)
+    near = cKDTree(XYZ).query(thinned.points + thinned.origin)[1]
+    np.testing.assert_allclose(thinned.intensity, BRIGHT["intensity"][near], atol=off)
