@@ -73,7 +73,7 @@ def write_folder(
         thinned = thin_cloud(result.cloud, _PREVIEW_VOXEL)
         preview = trimesh.PointCloud(thinned.points)
         if thinned.intensity is not None:
-            preview.vertex_attributes = {"intensity": thinned.intensity}
+            preview.vertex_attributes = {"intensity": thinned.intensity}  # type: ignore[attr-defined]  # its PLY has them
         preview.export(folder / "cloud.ply")
         if crs:
             _comment(folder / "cloud.ply", f"crs {crs}")
