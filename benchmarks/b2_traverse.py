@@ -201,7 +201,7 @@ def wilson(rate: float, n: int) -> tuple[float, float]:
     z = 1.96
     middle, half = rate + z * z / (2 * n), z * math.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n))
     low, high = (100.0 * (middle + sign * half) / (1 + z * z / n) for sign in (-1, 1))
-    return max(round(low, 1), 0.0), min(round(high, 1), 100.0)
+    return max(0.0, round(low, 1)), min(100.0, round(high, 1))
 
 
 def main(words: list[str] | None = None) -> int:

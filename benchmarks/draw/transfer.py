@@ -30,8 +30,8 @@ class TransferConfig:
 def run(config: TransferConfig) -> None:
     """Draws success beside what the kinematic robot leaves out, for each task and policy."""
     found = {record.id: record for record in read_records(config.records)}
-    parts = [name.split("/") for name in found if name.endswith("/success") and name.startswith("b2/wheels/")]
-    drives = [(task, agent) for _, _, task, agent, _ in parts]
+    parts = [name.split("/") for name in found if name.startswith("b2/wheels/") and name.endswith("/success")]
+    drives = [(task, agent) for _, _, task, agent, _ in parts if f"b2/rover/{task}/mjx/{agent}/success" in found]
     figure, axes = plt.subplots(1, 1 + len(_LEFT_OUT), figsize=(13.0, 3.6), layout="constrained", sharey=True)
     for panel, figure_name in zip(axes, ("success", *_LEFT_OUT), strict=True):
         panel.set_title(_LEFT_OUT.get(figure_name, "success, %"), fontsize=10)
