@@ -34,7 +34,7 @@ def wall_brightness(
     """
     _, _, tangent_x, tangent_y, _ = at_station(tunnel, station)
     near = station + (ends[:, 0] - position[0]) * tangent_x + (ends[:, 1] - position[1]) * tangent_y
-    node = jax.lax.optimization_barrier(jax.vmap(node_at, (None, 0))(tunnel, near))  # else once for each column
+    node = jax.vmap(node_at, (None, 0))(tunnel, near)
     row = tunnel.grid[node]
     away, tangent = ends[:, :2] - row[:, :2], row[:, 2:4]
     if texture is None:

@@ -3,7 +3,6 @@
 import dataclasses
 from typing import Any, ClassVar
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -35,7 +34,6 @@ class PlanarLidar(Part):
         ranges = sensing.corrupt(jnp.minimum(walls, things))
         entries = {"ranges": lidar.add_noise(ranges, noise.normal, params.lidar)}
         if params.lidar.intensity:
-            directions = jax.lax.optimization_barrier(directions)  # trigonometry is done once
             ends = sensing.position + walls[:, None] * directions
             factor, tangent = wall_brightness(
                 sensing.tunnel, sensing.station, sensing.position, ends, params.lidar.texture

@@ -13,6 +13,7 @@ from subterra_jax.baselines.agent import observed
 from subterra_jax.baselines.steering import CentreLine
 from subterra_jax.host.errors import TunnelError
 from subterra_jax.host.texture import RING, brightness, texture_seed, wall_angle
+from subterra_jax.parts.brightness import normal_beside
 from subterra_jax.policies.locate import bends, strips
 from tests.subterra_jax.placing import observe, placed
 
@@ -40,6 +41,14 @@ def test_a_wall_is_equally_bright_for_numpy_and_jax_and_plain_at_dial_0():
     half = np.log(brightness(np, *places, 7, 0.5))
     np.testing.assert_allclose(half, 0.5 * np.log(seen), atol=1e-5)
     assert abs(np.corrcoef(seen, brightness(np, *places, 8, 1.0))[0, 1]) < 0.05
+
+
+def test_noise_of_a_channel_is_normal_and_of_its_own():
+    first = jax.random.normal(jax.random.key(0), (20_000,))
+    others = np.stack([first, *(normal_beside(first, channel) for channel in (1, 2))])
+    np.testing.assert_allclose(others.mean(axis=1), 0.0, atol=0.03)
+    np.testing.assert_allclose(others.std(axis=1), 1.0, atol=0.02)
+    np.testing.assert_allclose(np.corrcoef(others), np.eye(3), atol=0.03)
 
 
 def test_neighbours_are_alike_also_across_the_seam_and_joints_are_dark():
