@@ -1,7 +1,7 @@
 """Draws a scene, walls, the film of an episode, or the transfer to a rover.
 
-`python -m benchmarks.draw scene build/tunnel --out view.png`; likewise `film`, `walls` and `transfer`.
-`--help` after one of them says more.
+`python -m benchmarks.draw scene build/tunnel --out view.png`; so do `film`, `walls`,
+`transfer`. `--help` after one of them says more.
 """
 
 import sys
