@@ -1,6 +1,5 @@
 """The bore: the reconstructed solid as a centreline with a section at every station."""
 
-import zipfile
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -8,7 +7,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
-from scene.errors import RecordingError
 from scene.geometry import Axis, make_axis
 
 SCHEMA = "subterra.bore/1"
@@ -69,21 +67,6 @@ class Bore:
         """Writes `bore.npz`, with curvature and grade of the axis; the same bore gives the same bytes."""
         own: dict[str, Any] = {part.name: getattr(self, part.name) for part in fields(self)}
         np.savez_compressed(path, schema=SCHEMA, **own, curvature=self.axis.curvature, grade=self.axis.grade)
-
-
-def load_bore(path: Path) -> Bore:
-    """Reads `bore.npz`; raises `RecordingError` for any other file and for another schema."""
-    try:
-        with np.load(path) as data:
-            if str(data["schema"]) != SCHEMA:
-                raise RecordingError(
-                    f"{path}: schema is {data['schema']}, not {SCHEMA}, so another version of Subterra wrote it; "
-                    "build the scene again with `python -m scene.build`"
-                )
-            values = {part.name: data[part.name] for part in fields(Bore) if part.name in data}
-            return Bore(**values)
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
-        raise RecordingError(f"{path}: not a bore file ({error})") from error
 
 
 def uniform_stations(length: float) -> Float[np.ndarray, " n"]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from scene.bore import Bore, load_bore
+from scene.bore import Bore
 from scene.cloud import Cloud
 from scene.fitting import section
 from scene.fitting.assemble import find_fold, fit_unfolded
@@ -116,7 +116,8 @@ def test_a_wall_seen_too_thinly_gets_the_standard_lining_on_request_marked_so(tm
     assert (bore.pocket["depth"] == 0.13).all()
     np.testing.assert_allclose(np.diff(bore.ring_station), 1.5)
     bore.save(tmp_path / "bore.npz")
-    np.testing.assert_array_equal(load_bore(tmp_path / "bore.npz").nail, bore.nail)
+    with np.load(tmp_path / "bore.npz") as data:
+        np.testing.assert_array_equal(data["nail"], bore.nail)
 
 
 @pytest.mark.parametrize(

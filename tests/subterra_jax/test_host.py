@@ -20,8 +20,6 @@ import tyro
 
 import subterra_jax
 import subterra_jax as st
-from scene.bore import load_bore
-from scene.errors import RecordingError as SceneError
 from subterra_jax import list_tasks, policies
 from subterra_jax.__main__ import COMMANDS
 from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
@@ -278,19 +276,11 @@ def test_a_tunnel_of_another_version_says_what_to_do(tmp_path):
         st.load_tunnel(new)
 
 
-def test_a_bore_of_another_version_says_what_to_do(tmp_path):
-    np.savez(tmp_path / "bore.npz", schema=np.array("subterra.bore/0"))
-    with pytest.raises(SceneError, match=r"another version of Subterra wrote it; .* `python -m scene\.build`"):
-        load_bore(tmp_path / "bore.npz")
-
-
-def test_an_archive_that_was_cut_short_is_no_bore_and_no_tunnel(tmp_path):
+def test_an_archive_that_was_cut_short_is_no_tunnel(tmp_path):
     cut = tmp_path / "cut.npz"
     cut.write_bytes(packaged("subterra-351.npz").read_bytes()[:50_000])
     with pytest.raises(st.TunnelError, match="cut short"):
         st.load_tunnel(cut)
-    with pytest.raises(SceneError, match="not a bore file"):
-        load_bore(cut)
 
 
 @pytest.mark.parametrize(("number", "says"), [(0, "older .* `python -m train.release`"), (2, "newer .* --upgrade")])
