@@ -79,6 +79,7 @@ def build(
         load_module(reader)
     inputs = [path for path in (source, *more, trajectory, control) if path is not None and path.exists()]
     kept = find_kept(out, inputs, (config.reconstruct.voxel, config.reconstruct.reading, mounts, reader))
+    refused = out.with_name(f"{out.name}-refused.html")  # the report then; the folder stays as it was
     started = time.monotonic()
     try:
         with Stages() as progress:
@@ -96,11 +97,13 @@ def build(
             _print_time(started, f"scene: written and compiled by MuJoCo {mujoco.__version__}")
     except FitError as error:
         if error.page:
-            raise _leave_page(error, out) from error
+            with replace_file(refused) as fresh:
+                fresh.write_text(error.page, encoding="utf-8")
+            raise error.about(f"{error} ({refused} shows why)") from error
         forget_kept(out)
         raise
     forget_kept(out)
-    _page_of_refusal(out).unlink(missing_ok=True)  # of an earlier try
+    refused.unlink(missing_ok=True)  # of an earlier try
     print(judgement.summary(), flush=True)
     laid = describe_track(track, result.seen)["laid"]
     print(f"track: {laid}" + ("; --track standard lays one" if "no rails" in laid else ""), flush=True)
@@ -247,18 +250,6 @@ def _require_trust(name: str, result: Reconstruction, judgement: Judgement, forc
         shown = {"detected": result.facts, "removed": [part.facts for part in result.removed]}
         error.page = render_page(name, result.bore, judgement, shown)
         raise
-
-
-def _page_of_refusal(out: Path) -> Path:
-    """Return the place of the report on a build that was refused: beside its folder, which stays as it was."""
-    return out.with_name(f"{out.name}-refused.html")
-
-
-def _leave_page(error: FitError, out: Path) -> FitError:
-    """Writes the report of a refused build; returns the error with the place of the report in its sentence."""
-    with replace_file(_page_of_refusal(out)) as fresh:
-        fresh.write_text(error.page, encoding="utf-8")
-    return error.about(f"{error} ({_page_of_refusal(out)} shows why)")
 
 
 def _print_time(started: float, text: str) -> None:

@@ -203,7 +203,9 @@ def find_floors(
     count = max(int((end - start) / _FLOOR_STEP), 1)
     middle = start + (np.arange(count) + 0.5) * (end - start) / count
     order = np.argsort(station, kind="stable")
-    half = _half_window(station, start, end, count)
+    inside = int(((station >= start) & (station <= end)).sum())
+    needed = _ENOUGH / max(inside, 1) * (end - start)  # more than a section's where a cloud is thin
+    half = max(min(needed, _LONGEST_WINDOW), (end - start) / count) / 2
     first, last = (np.searchsorted(station[order], middle + side * half) for side in (-1, 1))
     lines: list[list[tuple[float, float]]] = []
     for k in range(count):
@@ -231,15 +233,6 @@ def find_floors(
 
 
 _ENOUGH, _LONGEST_WINDOW = 1000, 4.0  # points that show a floor beside sleepers; m
-
-
-def _half_window(station: np.ndarray, start: float, end: float, count: int) -> float:
-    """Half the length of bore that one floor line is fitted to, m: more than a section's where a cloud is thin."""
-    inside = int(((station >= start) & (station <= end)).sum())
-    needed = _ENOUGH / max(inside, 1) * (end - start)
-    return max(min(needed, _LONGEST_WINDOW), (end - start) / count) / 2
-
-
 _MIDDLE, _PIT, _PIT_SHARE = 1.2, 0.5, 0.05  # m beside the axis; m below its floor; share of the returns that low
 
 

@@ -277,7 +277,9 @@ def add_standard_lining(
     rings = {"rings": MEASURED} if len(bore.ring_station) else {"rings": STANDARD}
     joints = np.arange(config.ring_width / 2, bore.length, config.ring_width)
     joints = joints[_is_even(bore, joints)]
-    pockets = _standard_pockets(bore, joints, config, flat_floor)
+    rows = np.linspace(-config.clock_angle, np.pi + config.clock_angle, max(config.pockets_per_ring, 1))
+    station = joints[:, None, None] + config.pocket_offset * np.array([-1.0, 1.0])[None, :, None] + 0 * rows
+    pockets = _make_pockets(bore, station.ravel(), (rows + 0 * station).ravel(), config, flat_floor)
     if not needed or not len(pockets):
         provenance = rings if len(bore.ring_station) else {"rings": "none"}
         return bore, {**provenance, "pockets": "none: the survey cannot show them", "nails": "none"}
@@ -312,15 +314,6 @@ def _is_even(bore: Bore, station: Float[np.ndarray, " k"]) -> Bool[np.ndarray, "
     wander = uniform_filter1d(bore.radius**2, reach, axis=0) - uniform_filter1d(bore.radius, reach, axis=0) ** 2
     rough = np.sqrt(np.maximum(np.median(wander, axis=1), 0.0)) > _ROUGH
     return ~rough[np.clip(np.searchsorted(bore.station, station), 0, len(bore.station) - 1)]
-
-
-def _standard_pockets(
-    bore: Bore, joints: Float[np.ndarray, " j"], config: LiningConfig, flat_floor: bool
-) -> Shaped[np.ndarray, " p"]:
-    rows = np.linspace(-config.clock_angle, np.pi + config.clock_angle, max(config.pockets_per_ring, 1))
-    station = joints[:, None, None] + config.pocket_offset * np.array([-1.0, 1.0])[None, :, None] + 0 * rows
-    angle = rows + 0 * station
-    return _make_pockets(bore, station.ravel(), angle.ravel(), config, flat_floor)
 
 
 def _make_pockets(

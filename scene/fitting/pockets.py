@@ -116,7 +116,10 @@ def find_pockets(sections: Sections) -> tuple[Shaped[np.ndarray, " p"], Float[np
     Position is each pocket's own; length, width and depth are common to all. Holes that stand in no rows, have no rims,
     or could be chance are no pockets: both results are empty then.
     """
-    deficit = _deficit(sections)
+    expected = uniform_filter(sections.support, _EXPECTED, mode=MODES)
+    share = sections.support / np.maximum(expected, 1e-9)
+    # Share of the wall's returns that each cell lacks against those around it: 0 none, 1 all.
+    deficit = np.where((expected > _MIN_EXPECTED) & ~_near_floor(sections), np.clip(1 - share, -1, 1), 0.0)
     faint = _find_holes(deficit, sections)
     weak = faint.where(faint.score > _WEAK)
     reach = _ROW_WIDTH / (2 * np.pi * np.median(sections.radius) / sections.grid.columns)
@@ -193,14 +196,6 @@ def could_show_pockets(sections: Sections, depth: float) -> bool:
     seen = float(np.mean(near > _MIN_EXPECTED)) if near.size else 0.0
     noise = float(np.median(sections.spread))
     return seen > _MIN_SEEN and noise < _NOISE_SHARE * depth
-
-
-def _deficit(sections: Sections) -> Float[np.ndarray, "rows cols"]:
-    """Share of the wall's returns that each cell lacks against those around it: 0 none, 1 all."""
-    expected = uniform_filter(sections.support, _EXPECTED, mode=MODES)
-    share = sections.support / np.maximum(expected, 1e-9)
-    deficit = np.where(expected > _MIN_EXPECTED, np.clip(1 - share, -1, 1), 0.0)
-    return np.where(_near_floor(sections), 0.0, deficit)
 
 
 def _near_floor(sections: Sections) -> np.ndarray:

@@ -331,7 +331,10 @@ def _cell_areas(bore: Bore, edges: np.ndarray) -> Float[np.ndarray, "r c"]:
 
 
 def _list_pieces(seen: np.ndarray, area: np.ndarray, edges: np.ndarray) -> tuple[Unseen, ...]:
-    labels = _label_around(~seen)
+    labels, count = label(~seen)
+    both = labels[:, [0, -1]][~seen[:, 0] & ~seen[:, -1]].T  # the last column is beside the first
+    joins = csr_matrix((np.ones(both.shape[1]), both), shape=(count + 1, count + 1))
+    labels = connected_components(joins, directed=False)[1][labels]
     pieces = []
     for index in range(1, int(labels.max(initial=0)) + 1):
         row, column = np.nonzero(labels == index)
@@ -344,11 +347,3 @@ def _list_pieces(seen: np.ndarray, area: np.ndarray, edges: np.ndarray) -> tuple
         across = float(area[row.min() : row.max() + 1].sum())
         pieces.append(Unseen(start, end, size, name_sides(_CENTRES[column], area[row, column]), size / across))
     return tuple(sorted(pieces, key=lambda piece: (-piece.area, piece.start)))
-
-
-def _label_around(cells: np.ndarray) -> Int[np.ndarray, "r c"]:
-    """Number the connected parts of a grid from 1, 0 elsewhere; the last column is beside the first."""
-    labels, count = label(cells)
-    both = cells[:, 0] & cells[:, -1]
-    joins = csr_matrix((np.ones(both.sum()), (labels[both, 0], labels[both, -1])), shape=(count + 1, count + 1))
-    return connected_components(joins, directed=False)[1][labels]

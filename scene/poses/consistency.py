@@ -79,7 +79,9 @@ def check_poses(recording: Recording, trajectory: Trajectory, orders: bool = Tru
     Another order of the quaternions is only tried with `orders`: what the user has said is not detected away. Raises
     `RecordingError` where a scan is damaged.
     """
-    groups = [_numbers_of_place(place, recording.scan_count) for place in _PLACES]
+    count, span = recording.scan_count, _SCANS * _EVERY  # sweeps
+    first = [int(place * max(count - span, 0)) for place in _PLACES]
+    groups = [range(number, min(number + span, count), _EVERY) for number in first]
     picked = dict(recording.pick(number for group in groups for number in group))
     places = [
         [picked[number].pick(_POINTS, _near(picked[number])) for number in group if _usable(picked[number], trajectory)]
@@ -126,12 +128,6 @@ def reorder(trajectory: Trajectory) -> Trajectory:
     wxyz = trajectory.rotations.as_quat()
     rotations = Rotation.from_quat(wxyz[:, [1, 2, 3, 0]])
     return Trajectory(trajectory.times, trajectory.positions, rotations, trajectory.source)
-
-
-def _numbers_of_place(place: float, count: int) -> list[int]:
-    """Return the numbers of a few sweeps at a share of the recording."""
-    first = int(place * max(count - _SCANS * _EVERY, 0))
-    return list(range(first, min(first + _SCANS * _EVERY, count), _EVERY))
 
 
 def _near(scan: Scan) -> np.ndarray:

@@ -74,19 +74,16 @@ class Tracker:
                 pose = _blend_poses(result, pose, *self._sigmas(guide))
         if size >= MIN_POINTS or (size and not self.poses):
             self._map.insert(source, pose)
-        self._accept(pose, middle)
+        if self.poses:
+            self._step, self._pace = np.linalg.inv(last) @ pose, gap
+        self._time = middle
+        self.poses.append(pose)
         return weakest
 
     def trajectory(self, times: list[float], source: str) -> Trajectory:
         """Return the poses of all sweeps, of whose middles `times`, s, are."""
         stack = np.stack(self.poses)
         return Trajectory(np.array(times), stack[:, :3, 3], Rotation.from_matrix(stack[:, :3, :3]), source)
-
-    def _accept(self, pose: np.ndarray, middle: float) -> None:
-        if self.poses:
-            self._step, self._pace = np.linalg.inv(self.poses[-1]) @ pose, middle - self._time
-        self._time = middle
-        self.poses.append(pose)
 
     def _sigmas(self, guide: Guide | None) -> tuple[float, float]:
         if guide is None:

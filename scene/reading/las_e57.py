@@ -225,7 +225,9 @@ def open_e57(path: Path) -> CloudSource:
     except ImportError as error:
         raise RecordingError(f"{path}: E57 is read by pye57, which is not installed: pip install pye57") from error
     with E57(str(path)) as file:
-        scans, crs = file.scan_count, _e57_crs(file)
+        scans, root = file.scan_count, file.image_file.root()
+        name = "coordinateMetadata"
+        crs = (str(root[name].value()).strip() or None) if root.isDefined(name) else None
     left_out: Counter[str] = Counter()
 
     def chunks() -> Iterator[np.ndarray]:
@@ -238,13 +240,6 @@ def open_e57(path: Path) -> CloudSource:
                     raise ValueError(f"scan {index} of {scans}: {error}") from error
 
     return CloudSource(f"E57, {scans} scans", chunks, np.empty((0, 3)), "m", None, crs, left_out)
-
-
-def _e57_crs(file: "E57") -> str | None:
-    """Return what the file says of its coordinate reference system; `None` where it says nothing."""
-    root = file.image_file.root()
-    name = "coordinateMetadata"
-    return (str(root[name].value()).strip() or None) if root.isDefined(name) else None
 
 
 def _read_e57_scan(file: "E57", header: "ScanHeader", left_out: Counter[str]) -> Iterator[np.ndarray]:

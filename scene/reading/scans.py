@@ -117,13 +117,9 @@ def parse_custom_msg(raw: bytes, cdr: bool = False) -> RawScan:
             points = np.frombuffer(body, _LIVOX_POINT, count, offset + 4)
     except (struct.error, ValueError) as error:
         raise ValueError(f"not a whole CustomMsg: {error}") from error
-    return _livox_scan(secs + nsecs * 1e-9, points)
-
-
-def _livox_scan(stamp: float, points: np.ndarray) -> RawScan:
     points = points[points["tag"] & _TAG_RETURN_MASK == 0]
     xyz = np.stack([points["x"], points["y"], points["z"]], axis=1)
-    scan = make_scan(stamp, xyz, points["offset_time"], "offset_time", points["reflectivity"])
+    scan = make_scan(secs + nsecs * 1e-9, xyz, points["offset_time"], "offset_time", points["reflectivity"])
     return replace(scan, unit="ns")
 
 

@@ -138,7 +138,7 @@ def add_materials(parts: SceneParts, rings: bool, reuse: bool) -> None:
     ET.SubElement(parts.asset, "material", name="lamp", rgba="1 0.97 0.88 1", emission="1")
 
 
-def add_lights(world: ET.Element, bore: Bore, track: Track, spacing: float) -> int:
+def add_lights(world: ET.Element, bore: Bore, spacing: float) -> int:
     """Adds a light at every lamp; those nearest the start are on, since few can be at a time."""
     station = np.arange(spacing / 2, bore.length, spacing)
     crown = bore.toward(np.pi / 2)
@@ -240,7 +240,7 @@ def write_scene(
     count["nails"] = add_nails(parts, bore, config.chunk_length)
     if furnished:
         _add_furniture(world, furnished)
-    count["lights"] = add_lights(world, bore, track, config.furniture.lamp_spacing)
+    count["lights"] = add_lights(world, bore, config.furniture.lamp_spacing)
     add_cameras(world, bore, track)
     add_rover(root, world, bore, track, config.lidar_height)
     ET.indent(root)

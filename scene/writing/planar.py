@@ -6,7 +6,7 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 from jaxtyping import Float
-from manifold3d import Manifold, Mesh64
+from manifold3d import CrossSection, Manifold, Mesh64
 from scipy.spatial.transform import Rotation
 
 from scene.bore import Bore
@@ -110,7 +110,7 @@ def cut_walls(solid: Manifold, bore: Bore, elevation: Float[np.ndarray, " n"], h
     polygons = level.slice(height).simplify(_COLLINEAR).to_polygons()
     if not polygons:
         raise FitError(f"no wall {height:g} m above the track: the bore is not that high there", Refusal.LEVEL)
-    outline = max(polygons, key=_area)
+    outline = max(polygons, key=lambda polygon: CrossSection([polygon]).area())
     plan = axis.in_plan()
     along, across, _ = plan.local(np.column_stack([outline, np.zeros(len(outline))]))
     left, right = across > 0, across <= 0
@@ -186,8 +186,3 @@ def save_tunnel(
         arrays |= {f"right_{variant}": walls.right, f"right_station_{variant}": walls.right_station}
         arrays[f"furniture_{variant}"] = (furniture or {}).get(variant, np.empty((0, 4)))
     write_tunnel(path, facts, arrays)
-
-
-def _area(polygon: Float[np.ndarray, "k 2"]) -> float:
-    x, y = polygon.T
-    return float(np.abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))) / 2)
