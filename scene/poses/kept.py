@@ -43,11 +43,12 @@ def keep_placed(path: Path, placed: Placed) -> None:
         "record": placed.record, "facts": placed.facts, "located": located.facts, "estimated": located.estimated,
         "uncovered": located.most_uncovered, "source": poses.source, "returns": cloud.returns, "voxel": cloud.voxel,
     }  # fmt: skip
+    intensity: dict[str, Any] = {} if cloud.intensity is None else {"intensity": cloud.intensity}
     with replace_file(path) as fresh, fresh.open("wb") as file:
         np.savez(
             file, facts=json.dumps(facts, default=lambda value: value.tolist()), points=cloud.points,
             weights=cloud.weights, origin=cloud.origin, low=placed.low, times=poses.times, positions=poses.positions,
-            rotations=poses.rotations.as_quat(), **({} if cloud.intensity is None else {"intensity": cloud.intensity}),
+            rotations=poses.rotations.as_quat(), **intensity,
         )  # fmt: skip
 
 
