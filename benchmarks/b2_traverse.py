@@ -17,6 +17,7 @@ from typing import Any, Literal
 
 import jax
 import numpy as np
+from scipy.stats import binomtest
 
 import subterra_jax as st
 from benchmarks.command import BenchmarkError, require_least, run_main
@@ -87,7 +88,6 @@ def _check(arguments: Command) -> None:
 
 
 def _open(arguments: Command) -> tuple[Any, Any]:
-    """Makes the task for the robot."""
     tunnel: Any = None if arguments.tunnel is None else names_of(arguments.tunnel)
     if arguments.length:
         plans = [load_tunnel(name) for name in tunnel or [None]]
@@ -108,7 +108,6 @@ def _open(arguments: Command) -> tuple[Any, Any]:
 
 
 def _drive(arguments: Command, share: int = 0) -> tuple[transfer.Walk, transfer.Row, Any]:
-    """Drives the robots of one of the processes."""
     env, params = _open(arguments)
     count, levels = params.tunnel.count, np.asarray(env.levels(params))
     index = np.array_split(np.arange(arguments.robots), arguments.jobs)[share]
@@ -182,32 +181,21 @@ def records_of(arguments: Command, figures: dict[str, float]) -> list[Record]:
     records = []
     for figure, value in figures.items():
         stem, _, unit = figure.rpartition("_")
-        rate, end = value / 100.0, ("success", "fall", "contact")
-        interval = wilson(rate, n) if stem in end else None
+        interval, tolerance = None, 0.1 * abs(value)
+        if stem in ("success", "fall", "contact"):
+            share = binomtest(round(value / 100.0 * n), n).proportion_ci(method="wilson")
+            interval = round(100.0 * share.low, 1), round(100.0 * share.high, 1)
+            tolerance = 100.0 * 1.96 * math.sqrt(0.25 / n)
         records.append(
             measured(
                 f"{name}/{(stem if unit in ('percent', 'deg') else figure).replace('_', '-')}",
                 round(value, 1) if unit in ("percent", "deg") else float(f"{value:.3g}"),
                 _UNITS.get(unit, ""), f"benchmarks.b2_traverse {words}",
-                interval=interval, tolerance=100.0 * 1.96 * math.sqrt(0.25 / n) if stem in end else 0.1 * abs(value),
-                **further,
+                interval=interval, tolerance=tolerance, **further,
             )
         )  # fmt: skip
     return records
 
 
-def wilson(rate: float, n: int) -> tuple[float, float]:
-    """Returns the 95 % interval of a share of `n`, %, after Wilson."""
-    z = 1.96
-    middle, half = rate + z * z / (2 * n), z * math.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n))
-    low, high = (100.0 * (middle + sign * half) / (1 + z * z / n) for sign in (-1, 1))
-    return max(0.0, round(low, 1)), min(100.0, round(high, 1))
-
-
-def main(words: list[str] | None = None) -> int:
-    """Runs the command line; returns 2 for a user's mistake."""
-    return run_main("b2_traverse", Command, command, words=words)
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_main("b2_traverse", Command, command))

@@ -103,7 +103,8 @@ def jobs_of(config: BoardConfig) -> list[Job]:
     """
     found = []
     for name in config.tasks:
-        task = _task_name(name)
+        id = find(name, short=True)
+        task = id.removeprefix("Subterra/").removesuffix("-v1") if id.startswith("Subterra/") else id
         for hidden in _STARTS[config.start]:
             if hidden and task not in _HIDES:
                 continue
@@ -114,12 +115,6 @@ def jobs_of(config: BoardConfig) -> list[Job]:
                     sensor = config.sensor if entry.group == "other" else entry.sensor
                     found.append(Job(Setting(task, hidden, config.texture), agent, sensor))
     return list(dict.fromkeys(found))
-
-
-def _task_name(name: str) -> str:
-    """Return a task as cells name it: the benchmark's by its short name, one's own by its id."""
-    id = find(name, short=True)
-    return id.removeprefix("Subterra/").removesuffix("-v1") if id.startswith("Subterra/") else id
 
 
 def enter(job: Job, tunnel: Any) -> tuple[Any, Any]:

@@ -7,9 +7,10 @@
 import sys
 from importlib import import_module
 
+from benchmarks.command import run_main
 from subterra_jax.pictures.renderer import choose_gl
 
-COMMANDS = ("scene", "film", "walls", "transfer")
+COMMANDS = {"scene": "RenderConfig", "film": "FilmConfig", "walls": "WallsConfig", "transfer": "TransferConfig"}
 
 
 def main(words: list[str] | None = None) -> int:
@@ -17,7 +18,8 @@ def main(words: list[str] | None = None) -> int:
     words = sys.argv[1:] if words is None else words
     if words and words[0] in COMMANDS:
         choose_gl()  # before anything imports MuJoCo
-        return int(import_module(f"benchmarks.draw.{words[0]}").main(words[1:]))
+        module = import_module(f"benchmarks.draw.{words[0]}")
+        return run_main(f"draw {words[0]}", getattr(module, COMMANDS[words[0]]), module.run, words=words[1:])
     if words and words[0] in ("-h", "--help"):
         print(__doc__)
         return 0

@@ -21,7 +21,7 @@ from matplotlib.transforms import Affine2D
 from PIL import Image
 
 import subterra_jax as st
-from benchmarks.command import BenchmarkError, run_main
+from benchmarks.command import BenchmarkError
 from benchmarks.results import write_file
 from subterra_jax import policies
 from subterra_jax.host.files import require_file
@@ -60,11 +60,6 @@ class FilmConfig:
     sensor: str = SENSORS[0]  # LiDAR.
     seed: int = 0  # Seed of the episode.
     pictures: int = 110  # Number of pictures.
-
-
-def main(words: list[str] | None = None) -> int:
-    """Runs the command."""
-    return run_main("draw film", FilmConfig, run, words=words)
 
 
 def run(config: FilmConfig) -> None:
@@ -189,11 +184,11 @@ def _plan(axes: Axes, drawn: Drawn, radius: float) -> Any:
         tangent = plan.tangent[np.searchsorted(plan.station, station[row]).clip(max=len(plan.station) - 1)]
         along = float(np.arctan2(tangent[1], tangent[0]))
         walls.set_transform(Affine2D().translate(*-drawn.truth[row, :2]).rotate(-along) + axes.transData)
-        turn = _rotation(float(drawn.heading[row]) - along)
-        ends = drawn.hits[row, :, :2] @ turn.T
+        turn = Affine2D().rotate(float(drawn.heading[row]) - along)
+        ends = turn.transform(drawn.hits[row, :, :2])
         beams.set_segments([np.stack([np.zeros(2), end]) for end in ends] if len(ends) <= _FEW else [])
         hits.set_data(*ends.T)
-        front = turn @ np.array([2.0 * radius, 0.0])
+        front = turn.transform((2.0 * radius, 0.0))
         nose.set_data([0.0, front[0]], [0.0, front[1]])
         over = f": {_end(drawn)}" if row == len(drawn) - 1 else ""
         text.set_text(f"station {station[row]:.1f} m{goal}{over}")
@@ -212,10 +207,6 @@ def wall_lines(drawn: Drawn) -> list[Float[np.ndarray, "n 2"]]:
 def _outline(middle: np.ndarray, axis: np.ndarray, half: np.ndarray) -> Float[np.ndarray, "5 2"]:
     corner = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1], [1, 1]]) * half
     return middle + corner @ np.array([axis, [-axis[1], axis[0]]])
-
-
-def _rotation(angle: float) -> Float[np.ndarray, "2 2"]:
-    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
 
 def _strip(axes: Axes, drawn: Drawn) -> Any:

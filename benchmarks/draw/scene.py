@@ -8,7 +8,7 @@ import tyro
 from jaxtyping import Float, UInt8
 from PIL import Image
 
-from benchmarks.command import BenchmarkError, require_least, run_main
+from benchmarks.command import BenchmarkError, require_least
 from subterra_jax.host.files import require_file
 from subterra_jax.pictures.renderer import import_mujoco, light_near, open_renderer
 
@@ -105,8 +105,3 @@ def run(config: RenderConfig) -> None:
         ahead = np.array(config.ahead) / max(float(np.linalg.norm(config.ahead)), 1e-9)
         camera = Pose(np.array(config.at), ahead, float(np.deg2rad(config.fov_deg)), config.width, config.height)
     Image.fromarray(picture(config.scene, camera, config.width, config.height)).save(config.out)
-
-
-def main(words: list[str] | None = None) -> int:
-    """Runs the command line; returns 2 for a user's mistake."""
-    return run_main("draw scene", RenderConfig, run, words=words)

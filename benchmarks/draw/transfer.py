@@ -9,7 +9,6 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from benchmarks.command import run_main
 from benchmarks.records import FOLDER, Record, read_records
 from benchmarks.results import png_bytes, write_file
 
@@ -56,8 +55,3 @@ def _reach(record: Record, sigma: Record | None) -> tuple[float, float]:
     if record.interval is not None:
         return record.value - record.interval[0], record.interval[1] - record.value
     return (sigma.value, sigma.value) if sigma is not None else (0.0, 0.0)
-
-
-def main(words: list[str] | None = None) -> int:
-    """Runs the command."""
-    return run_main("draw transfer", TransferConfig, run, words=words)

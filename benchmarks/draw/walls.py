@@ -13,7 +13,6 @@ import numpy as np
 from PIL import Image
 
 import subterra_jax as st
-from benchmarks.command import run_main
 from benchmarks.results import png_bytes, write_file
 from subterra_jax.evaluation.localisability import look_along
 from subterra_jax.host.texture import brightness, check_dial, wall_angle
@@ -76,8 +75,3 @@ def read(tunnel: st.TunnelPlan, texture: float) -> np.ndarray:
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = total.sum(axis=1) / count.sum(axis=1)
         return np.asarray(total / count - mean[:, None])
-
-
-def main(words: list[str] | None = None) -> int:
-    """Runs the command."""
-    return run_main("draw walls", WallsConfig, run, words=words)

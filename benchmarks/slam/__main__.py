@@ -18,7 +18,7 @@ from benchmarks.results import environment_facts, png_bytes, write_file
 from benchmarks.slam import board_page, score
 from benchmarks.slam.arena.sets import ArenaConfig, make_arena
 from benchmarks.slam.board import BoardConfig, make_board
-from benchmarks.slam.score import ProgramScore, ScoreConfig, score_all
+from benchmarks.slam.score import ScoreConfig, score_all
 
 _progress = Console(stderr=True, highlight=False)
 _PROG = "python -m benchmarks.slam"
@@ -55,16 +55,12 @@ def main(config: ArenaConfig | BoardConfig | ScoreConfig) -> None:
     else:
         scores = score_all(config)
         if config.out is not None:
-            _write_scores(config.out, scores)
+            write_file(config.out / "scores.json", score.as_json(scores, environment_facts()).encode())
+            write_file(config.out / "scores.md", score.as_markdown(scores).encode())
         table = Table(*score.HEAD)
         for row in score.as_rows(scores):
             table.add_row(*row)
         Console(width=190).print(table)
-
-
-def _write_scores(folder: Path, scores: list[ProgramScore]) -> None:
-    write_file(folder / "scores.json", score.as_json(scores, environment_facts()).encode())
-    write_file(folder / "scores.md", score.as_markdown(scores).encode())
 
 
 def _write_board(folder: Path) -> None:
