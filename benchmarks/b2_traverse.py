@@ -173,10 +173,9 @@ def records_of(arguments: Command, figures: dict[str, float]) -> list[Record]:
     place = arguments.scene or arguments.tunnel
     task += "" if place is None or ":" in str(place) else f"-in-{Path(place).stem}"
     name = "/".join(["b2", arguments.robot, task, *([] if arguments.robot == "wheels" else [arguments.engine]), agent])
-    given = {field.name: getattr(arguments, field.name) for field in dataclasses.fields(arguments)}
-    usual = {field.name: field.default for field in dataclasses.fields(arguments)}
-    changed = {key: value for key, value in given.items() if value != usual[key] and key not in ("out", "jobs")}
-    words = " ".join(f"--{key} {value}" for key, value in changed.items())
+    given = [(field.name, getattr(arguments, field.name), field.default) for field in dataclasses.fields(arguments)]
+    changed = [(key, value) for key, value, usual in given if value != usual and key not in ("out", "jobs")]
+    words = " ".join(f"--{key} {value}" for key, value in changed)
     further = {"n": n, "split": str(place or "the task's own tunnels")}
     records = []
     for figure, value in figures.items():

@@ -124,7 +124,6 @@ def main(config: DemoConfig) -> None:
 
 
 def _training_figures(run: Path) -> dict[str, Any]:
-    """Returns the last line of the training's log, and its evaluation."""
     last = json.loads((run / "log.jsonl").read_text().splitlines()[-1])
     evaluation = json.loads((run / "evaluation.json").read_text())
     return {

@@ -14,13 +14,13 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack, redirect_stderr, redirect_stdout
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import yaml
 from jaxtyping import Float, UInt64
 
-from benchmarks.command import BenchmarkError, run_main
+from benchmarks.command import require_least, run_main
 from benchmarks.records import Record, measured, write_records
 from benchmarks.results import markdown_table
 from scene.bore import Bore
@@ -71,10 +71,7 @@ Outcome = Literal[
     "as control", "static, as said", "refused, true reason", "other, with a warning", "refused, other reason",
     "wrong in silence",
 ]  # fmt: skip
-OUTCOMES: tuple[Outcome, ...] = (
-    "as control", "static, as said", "refused, true reason", "other, with a warning", "refused, other reason",
-    "wrong in silence",
-)  # fmt: skip
+OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)
 _DECIDED = {"after": "header", "same clock": "epoch", "other clock": "other clock", "static": "static", "": "refused"}
 
 
@@ -342,9 +339,7 @@ def properties(row: Row) -> Iterator[str]:
 
 def run(config: RecordingsConfig) -> int:
     """Measures, prints, writes; 1 where a recording was wrong in silence."""
-    for name in ("count", "workers"):
-        if getattr(config, name) < 1:
-            raise BenchmarkError(f"{name} must be at least 1, got {getattr(config, name)}")
+    require_least(config, count=1, workers=1)
     config.out.mkdir(parents=True, exist_ok=True)
     rows = measure(config)
     counts = Counter((kind, row.outcome) for row in rows for kind in properties(row))

@@ -35,11 +35,6 @@ class Pose:
         right /= np.linalg.norm(right)
         return np.stack([right, np.cross(right, self.ahead), self.ahead])
 
-    @property
-    def focal(self) -> float:
-        """Focal length, pixels."""
-        return 0.5 * self.height / float(np.tan(0.5 * self.fov))
-
 
 @dataclass(frozen=True)
 class RenderConfig:

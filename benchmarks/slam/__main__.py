@@ -64,7 +64,6 @@ def main(config: ArenaConfig | BoardConfig | ScoreConfig) -> None:
 
 
 def _write_board(folder: Path) -> None:
-    """Writes a board's table, figure and records beside its `board.json`, and prints the table."""
     board = json.loads((folder / "board.json").read_text())
     write_file(folder / "board.md", board_page.as_markdown(board).encode())
     write_file(folder / "board.png", png_bytes(board_page.draw_board(board), dpi=130))

@@ -195,7 +195,6 @@ def read_case(case: Case) -> dict[str, Any]:
 
 
 def _find_floors(config: BoardConfig) -> Iterator[dict[str, Any]]:
-    """Yields the floor of each recording of the sets, in order."""
     cases = [(folder, recording.name, config.out / "floors" / folder.name / f"{recording.name}.json")
              for folder in config.sets for recording in recordings_in(folder)]  # fmt: skip
     if config.jobs == 1 or all(kept.is_file() for *_, kept in cases):

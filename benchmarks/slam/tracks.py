@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -28,12 +28,9 @@ class Axis:
     frames: Float[np.ndarray, "n 3 3"]  # Unit vectors along, left and up as rows
     source: str  # Origin of the axis, for the report
 
-    def nearest(self, position: Float[np.ndarray, "k 3"]) -> Int[np.ndarray, " k"]:
-        return cKDTree(self.position).query(position)[1]
-
     def coordinates(self, position: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3"]:
         """Returns station, offset to the left and height over the axis of each position, m."""
-        near = self.nearest(position)
+        near = cKDTree(self.position).query(position)[1]
         aside = np.einsum("kij,kj->ki", self.frames[near], position - self.position[near])
         curvature = np.sum(np.gradient(self.frames[:, 0], self.station, axis=0) * self.frames[:, 1], axis=1)
         inside = (near > 0) & (near < len(self.station) - 1)
@@ -132,14 +129,11 @@ def read_track(estimate: Path, truth: Path, alignment: Alignment = "origin") -> 
     """
     if alignment not in ALIGNMENTS:
         raise BenchmarkError(f"no alignment {alignment!r}; there are {', '.join(ALIGNMENTS)}")
-    return align(_pair(*_load(estimate, truth)), alignment)
-
-
-def _load(estimate: Path, truth: Path) -> tuple[Trajectory, Trajectory]:
     try:
-        return load_tum(estimate), load_tum(truth)
+        both = load_tum(estimate), load_tum(truth)
     except RecordingError as error:
         raise BenchmarkError(str(error)) from error
+    return align(_pair(*both), alignment)
 
 
 def _pair(estimated: Trajectory, true: Trajectory) -> Track:

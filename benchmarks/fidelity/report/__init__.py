@@ -89,7 +89,8 @@ def report_content(
         "outside": _outside_entry(judgement),
         "controls": {
             "run": len(rows),
-            "complete": _all_bold(rows),
+            "complete": {(control.id, dose) for control in suite_controls().values() for dose in control.bold}
+            <= {(row["id"], row["dose"]) for row in rows},
             "undetected": judge.undetected(rows),
             "loud": judge.loud(rows),
         } if controls is not None else None,
@@ -138,11 +139,6 @@ def _outside_entry(judgement: Judgement) -> dict[str, Any] | None:
         "global": judgement.outside["base"].overall,
         "note": "The verdict and all other figures are those of the suite's 199 metrics alone.",
     }
-
-
-def _all_bold(rows: list[dict[str, Any]]) -> bool:
-    asked = {(control.id, dose) for control in suite_controls().values() for dose in control.bold}
-    return asked <= {(row["id"], row["dose"]) for row in rows}
 
 
 def _status(row: Metric, score: Score) -> str:

@@ -1,8 +1,8 @@
 """One stream of ROS 1 messages as a ROS 1 bag and as a ROS 2 bag in MCAP, byte for byte the same content."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -113,37 +113,28 @@ def write_bags(folder: Path, formats: Iterable[FormatName], stream: Iterable[Mes
         stream: Messages.
     """
     with ExitStack() as stack:
-        writers: list[Any] = []
+        writers: list[Callable[[Message], None]] = []
         if "bag" in formats:
-            writers.append(_Bag1(stack.enter_context(_lz4(folder / BAG))))
+            bag = rosbag1.Writer(folder / BAG)
+            bag.set_compression(rosbag1.Writer.CompressionFormat.LZ4)
+            writers.append(partial(_write_1, stack.enter_context(bag), {}))
         if "mcap" in formats:
             writer = rosbag2.Writer(folder / MCAP, version=9, storage_plugin=StoragePlugin.MCAP)
             writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
-            writers.append(_Bag2(stack.enter_context(writer)))
+            writers.append(partial(_write_2, stack.enter_context(writer), {}))
         for message in stream:
-            for one in writers:
-                one.write(message)
+            for write in writers:
+                write(message)
             yield message
 
 
-def _lz4(path: Path) -> rosbag1.Writer:
-    writer = rosbag1.Writer(path)
-    writer.set_compression(rosbag1.Writer.CompressionFormat.LZ4)
-    return writer
-
-
-class _Bag1:
-    def __init__(self, writer: rosbag1.Writer) -> None:
-        self._writer = writer
-        self._topics: dict[str, Any] = {}
-
-    def write(self, message: Message) -> None:
-        if message.topic not in self._topics:
-            text, md5 = ros1_store().generate_msgdef(message.kind)
-            self._topics[message.topic] = self._writer.add_connection(
-                message.topic, message.kind, msgdef=text, md5sum=md5, latching=int(message.kind == STATIC)
-            )
-        self._writer.write(self._topics[message.topic], messages.unix_nanoseconds(message.time), message.raw)
+def _write_1(writer: rosbag1.Writer, topics: dict[str, Any], message: Message) -> None:
+    if message.topic not in topics:
+        text, md5 = ros1_store().generate_msgdef(message.kind)
+        topics[message.topic] = writer.add_connection(
+            message.topic, message.kind, msgdef=text, md5sum=md5, latching=int(message.kind == STATIC)
+        )
+    writer.write(topics[message.topic], messages.unix_nanoseconds(message.time), message.raw)
 
 
 def custom_cdr(raw: bytes) -> bytes:
@@ -158,14 +149,9 @@ def custom_cdr(raw: bytes) -> bytes:
     return head[:-4] + count.to_bytes(4, "little") + padded.tobytes()[: -1 if count else None]
 
 
-class _Bag2:
-    def __init__(self, writer: rosbag2.Writer) -> None:
-        self._writer = writer
-        self._topics: dict[str, Any] = {}
-
-    def write(self, message: Message) -> None:
-        kind = _LIVOX_2 if message.kind == messages.CUSTOM_TYPE else message.kind
-        if message.topic not in self._topics:
-            self._topics[message.topic] = self._writer.add_connection(message.topic, kind, typestore=ros2_store())
-        raw = custom_cdr(message.raw) if kind == _LIVOX_2 else bytes(ros2_store().ros1_to_cdr(message.raw, kind))
-        self._writer.write(self._topics[message.topic], messages.unix_nanoseconds(message.time), raw)
+def _write_2(writer: rosbag2.Writer, topics: dict[str, Any], message: Message) -> None:
+    kind = _LIVOX_2 if message.kind == messages.CUSTOM_TYPE else message.kind
+    if message.topic not in topics:
+        topics[message.topic] = writer.add_connection(message.topic, kind, typestore=ros2_store())
+    raw = custom_cdr(message.raw) if kind == _LIVOX_2 else bytes(ros2_store().ros1_to_cdr(message.raw, kind))
+    writer.write(topics[message.topic], messages.unix_nanoseconds(message.time), raw)

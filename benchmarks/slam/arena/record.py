@@ -27,6 +27,7 @@ SensorName = Literal["avia", "vlp16", "os1-16", "os1-32", "os1-64"]
 IMU_TOPIC, IMU_FRAME, IMU_RATE = "/imu/data", "imu_link", 200.0
 # p_imu = p_lidar + shift: the IMU hangs 10 cm under the LiDAR and 5 cm behind it, axes parallel.
 IMU = Mount(np.eye(3), np.array([0.05, -0.02, 0.10]))
+_HERE = Mount(np.eye(3), np.zeros(3))
 _BEHIND, _AHEAD = 45.0, 45.0  # m of bore beyond the drive, further than echoes come back from
 _TRUTH_RATE, _AXIS_STEP = 200.0, 0.25  # Hz; m
 
@@ -114,12 +115,11 @@ def cast_sweeps(scene: Scene) -> Iterator[Sweep]:
     return sweeps(rng, lidar, carried, caster, SensorErrors(), veil=veil, face=face, doppler=doppler)
 
 
-_HERE = Mount(np.eye(3), np.zeros(3))
-
-
 def stream(scene: Scene) -> Iterator[Message]:
     """Yields all messages of a recording in order of time; a sweep comes when it is complete."""
-    yield bags.static_message(_transforms(scene))
+    level, height = np.array([0.0, 0.0, 0.0, 1.0]), np.array([0.0, 0.0, scene.drive.carrier.height])
+    frames = ((scene.sensor.frame, height), (IMU_FRAME, height + IMU.origin))
+    yield bags.static_message([bags.transform(frame, shift, level) for frame, shift in frames])
     waiting = sorted([*_inertial(scene), *_odometry(scene)[0]], key=lambda m: m[:2])
     sent, sensor = 0, scene.sensor
     for sweep in cast_sweeps(scene):
@@ -129,14 +129,6 @@ def stream(scene: Scene) -> Iterator[Message]:
             sent += 1
         yield Message(end, sensor.topic, sensor.kind, sensor.encode(sweep, sensor.lidar))
     yield from waiting[sent:]
-
-
-def _transforms(scene: Scene) -> list[Any]:
-    level, height = np.array([0.0, 0.0, 0.0, 1.0]), np.array([0.0, 0.0, scene.drive.carrier.height])
-    return [
-        bags.transform(scene.sensor.frame, height, level),
-        bags.transform(IMU_FRAME, height + IMU.origin, level),
-    ]
 
 
 def _inertial(scene: Scene) -> list[Message]:

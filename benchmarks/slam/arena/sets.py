@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.command import BenchmarkError
+from benchmarks.command import BenchmarkError, require_least
 from benchmarks.results import write_file
 from benchmarks.slam.arena.bags import FormatName
 from benchmarks.slam.arena.drives import CARRIERS
@@ -69,10 +69,7 @@ def plan_arena(config: ArenaConfig) -> list[Course]:
         raise BenchmarkError("nothing to record: courses and formats must name at least one")
     if not 5.0 <= config.distance <= 500.0:
         raise BenchmarkError(f"distance must lie between 5 and 500 m, got {config.distance:g}")
-    for name, least in (("seed", 0), ("jobs", 1), ("secret", 0)):
-        value = getattr(config, name)
-        if value is not None and value < least:
-            raise BenchmarkError(f"{name} must be at least {least}, got {value}")
+    require_least(config, seed=0, jobs=1, **({} if config.secret is None else {"secret": 0}))
     return [replace(known[name], distance=config.distance) for name in dict.fromkeys(config.courses)]
 
 
