@@ -47,7 +47,9 @@ def unrolled(texture, seed=None):
     seen = sweeps(np.random.default_rng(0), lidar, carried, caster, SensorErrors(), every=3, face=face)
     frames, images = bore.alignment.frames(np.array([scene.drive.begin])), []
     for sweep in islice(seen, 14, 16):
-        placed = (sweep.placed[sweep.valid] - frames.position[0]) @ frames.matrix[0]
+        true = carried.poses(1e-9 * (sweep.begin + sweep.offset[sweep.valid]))
+        returns = true.position + Rotation.from_quat(true.quaternion).apply(sweep.points[sweep.valid])
+        placed = (returns - frames.position[0]) @ frames.matrix[0]
         pose = scene.drive.poses(np.array([1e-9 * sweep.begin + 0.05])).position[0]
         sensor = (pose - frames.position[0]) @ frames.matrix[0]
         along, angle, value = odometry.unroll(placed - sensor, sweep.reflectivity[sweep.valid].astype(float))
