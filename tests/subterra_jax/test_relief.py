@@ -12,6 +12,7 @@ import subterra_jax as st
 from benchmarks import reference
 from subterra_jax import lidar, lidar3d
 from subterra_jax.host.errors import TunnelError
+from subterra_jax.host.unrolled import delaunay
 from subterra_jax.lidar3d import beams, cells, relief, rolled, surface
 from subterra_jax.lidar3d.relief import Relief
 from subterra_jax.lidar3d.surface import split_boxes
@@ -111,9 +112,9 @@ def test_every_triangle_is_delaunays_and_looks_inwards(name, window, monkeypatch
     shell = open_world.plan(name, variants=("built",), length=30.0).shell
     found = []
 
-    def searched(u, s, node, shape, girth, length, real=rolled._faces):
-        faces = real(u, s, node, shape, girth, length)
-        found.append((faces, rolled._delaunay(u, s, girth), u, s, girth))
+    def searched(grid, girth, length, real=rolled._faces):
+        faces, (u, s, *_) = real(grid, girth, length), grid
+        found.append((faces, delaunay(u, s, girth), u, s, girth))
         return faces
 
     monkeypatch.setattr(rolled, "_faces", searched)
@@ -124,6 +125,14 @@ def test_every_triangle_is_delaunays_and_looks_inwards(name, window, monkeypatch
     across, along = ((values[faces] - values[faces[:, :1]])[:, 1:] for values in (u, s))
     across = (across + girth / 2) % girth - girth / 2
     assert (across[:, 0] * along[:, 1] - across[:, 1] * along[:, 0] > 0.0).all()
+
+
+def test_a_wall_without_recess_or_corner_is_a_plain_grid_open_at_both_ends():
+    _, wall, *_ = rolled.raise_parts(st.load_tunnel("metro").shell, "smooth")
+    edges = np.sort(wall.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    count = np.unique(edges, axis=0, return_counts=True)[1]
+    assert count.max() == 2
+    assert len(wall.faces) == 2 * len(wall.vertices) - (count == 1).sum()  # Euler's formula for a tube
 
 
 N = 64
