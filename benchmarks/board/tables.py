@@ -45,10 +45,11 @@ def best_of(cells: Cells, setting: Setting, groups: tuple[Group, ...], split: st
         cell["agent"] for cell in cells if setting_of(cell) == setting and entry_of(cell["agent"]).group in groups
     }
     agents = {agent for agent in agents if over_split(cells, setting, agent, split) is not None}
-    chosen = {agent: over_split(cells, setting, agent, CHOICE) for agent in agents}
-    if not all(chosen.values()):
-        chosen = {agent: over_split(cells, setting, agent, split) for agent in agents}
-    return max(sorted(agents), key=lambda agent: chosen[agent].success, default=None)  # type: ignore[union-attr]
+    scores = {agent: over_split(cells, setting, agent, CHOICE) for agent in sorted(agents)}
+    if not all(scores.values()):
+        scores = {agent: over_split(cells, setting, agent, split) for agent in sorted(agents)}
+    success = {agent: score.success for agent, score in scores.items() if score is not None}
+    return max(success, key=success.__getitem__, default=None)
 
 
 def screen(cells: Cells, split: str = SPLIT) -> list[dict[str, Any]]:

@@ -4,6 +4,7 @@ Positions are given from the nearest row of the track, the *anchor*: coordinates
 Each ball or wheel meets the tangent planes of what is nearest to it, so that the cost does not depend on the tunnel.
 """
 
+import dataclasses
 from collections.abc import Sequence
 
 import jax
@@ -86,7 +87,7 @@ def join_tracks(tracks: Sequence[Track]) -> Track:
     """Join the grounds of several tunnels, in order."""
     before = np.cumsum([0, *(len(track.station) for track in tracks[:-1])]).tolist()
     moved = [
-        track.replace(first=track.first + row, last=track.last + row, tunnel=track.tunnel + k)  # type: ignore[attr-defined]
+        dataclasses.replace(track, first=track.first + row, last=track.last + row, tunnel=track.tunnel + k)
         for k, (track, row) in enumerate(zip(tracks, before, strict=True))
     ]
     return jax.tree.map(lambda *parts: jnp.concatenate(parts), *moved)

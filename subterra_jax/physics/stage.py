@@ -1,4 +1,4 @@
-"""Where a robot is put: the ground of its tunnels, its engine, the room beside it; and a whole tunnel for MuJoCo in C.
+"""A robot's place: the ground of its tunnels, its engine, the room beside it; and a whole tunnel for MuJoCo in C.
 
 That is a scene as it was built, or ground and walls of a plan.
 """
@@ -35,7 +35,7 @@ class RobotError(SubterraError):
 
 @dataclasses.dataclass(frozen=True)
 class Stage:
-    """Where a robot is put.
+    """A robot's place.
 
     Attributes:
         track: The ground of its tunnels.

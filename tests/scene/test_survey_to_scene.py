@@ -72,7 +72,7 @@ NAMED = BuildConfig(provenance="simulated")
 
 
 class Killed(BaseException):
-    """What ends a build as a signal does: nothing catches it."""
+    """End of a build as by a signal: nothing catches it."""
 
 
 def test_a_build_reads_twice_and_the_one_after_a_kill_reads_nothing_and_writes_the_same(

@@ -67,7 +67,7 @@ class Probe:
         return jnp.stack([speed, 0.0, jnp.nan, 0.0, 0.0]), memory
 
     def _gets(self, obs: Any, params: Any) -> jax.Array:
-        """Whether there are ranges, and whether there is a map, 1 or 0 each."""
+        """Return 1 where there are ranges, and 1 where there is a map; else 0."""
         n_beams = params.lidar.n_beams
         ranges = jnp.isfinite(obs.ranges).any() | jnp.isfinite(obs.flat[:n_beams]).any()
         tunnel = params.tunnel

@@ -35,10 +35,10 @@ from train.world import library_versions
 
 @dataclasses.dataclass(frozen=True)
 class Rare:
-    """What hardly anybody sets."""
+    """Options that hardly anybody sets."""
 
     depth: float = 1.0
-    """Of the thing, m."""
+    """Depth, m."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Common:
     """
 
     out: str
-    """Where."""
+    """Folder."""
     kind: int = 1
     """Which."""
     rare: Rare = dataclasses.field(default_factory=Rare)
@@ -75,7 +75,7 @@ def test_help_shows_the_commands_own_options_and_names_the_other_groups(capsys):
     page = shown(capsys, "--help")
     assert "--kind INT" in page
     assert "Example: python -m thing" in page
-    assert "Of the thing" not in page
+    assert "Depth, m" not in page
     assert page.endswith("--help-all shows further options: rare.\n")
 
 

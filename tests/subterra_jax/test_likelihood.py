@@ -40,7 +40,7 @@ def true_scan(tunnel, station: float, lateral: float, heading: float):
 
 
 def crossing(plan, wall, station: float, side: float) -> float:
-    """Where the normal of the centreline first meets a wall, by brute force over its segments, m."""
+    """Return the distance along the centreline's normal to a wall, by brute force over its segments, m."""
     centre, tangent = (
         np.array([np.interp(station, plan.station, values[:, i]) for i in range(2)])
         for values in (plan.centre, plan.tangent)

@@ -129,7 +129,7 @@ def test_an_episode_is_the_one_that_the_evaluation_drives_and_is_drawn_where_it_
 
 
 def played(path):
-    """What a page holds, and the messages that it plays: time, s, and content."""
+    """Return a page's text and the messages that it plays: time, s, and content."""
     page = path.read_text()
     packed = base64.b64decode(re.search(r'__VISER_EMBED_DATA__="([^"]+)"', page)[1])
     raw = zstandard.decompress(packed[8:])

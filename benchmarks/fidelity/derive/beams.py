@@ -233,8 +233,8 @@ def scan_descriptors(case: Case) -> tuple[Float[np.ndarray, "s d"], Float[np.nda
     for start, end in itertools.pairwise(bounds):
         kept = np.flatnonzero(both[start:end]) + start
         if len(kept) > np.prod(_DIRECTION_SECTORS):
-            pair = (_describe_scan(np.maximum(r[kept], 0.01), sector[kept]) for r in (real.range, reach))
-            rows.append(tuple(pair))  # type: ignore[arg-type]
+            one, other = (_describe_scan(np.maximum(r[kept], 0.01), sector[kept]) for r in (real.range, reach))
+            rows.append((one, other))
     if len(rows) < 10:
         raise ValueError(f"{len(rows)} scans with returns from the candidate are too few to tell apart")
     left, right = zip(*rows, strict=True)

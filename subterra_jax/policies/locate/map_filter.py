@@ -32,7 +32,6 @@ MARGIN = _WIDE + _TAPS // 2  # bins about a block that its features depend on
 SLACK = 12  # bins by which a row may be moved beyond the shifts
 N_SEEN = BLOCK + 2 * MARGIN  # bins of the profiles that a block needs
 N_REACH = BLOCK + 2 * (_STRIDE * SIDE + SLACK)  # bins of the map's features that a block needs
-N_MAP = N_REACH + 2 * MARGIN  # bins of the map that a block needs
 BEFORE = _STRIDE * SIDE + SLACK + round(FARTHEST / BIN)  # bins of the map before and after a whole drive
 _CHANNELS = 6
 _UNIT = 0.03  # m: relief that is large against noise

@@ -159,7 +159,7 @@ def test_a_robot_that_leaves_the_numbers_is_a_fall_and_corrupts_nobody(walking):
 
 @jax.jit
 def moved_aside(track, state, lateral):
-    """The same robots moved aside to that lateral offset, m."""
+    """Return the robots moved aside to a lateral offset, m."""
     turned = track.quaternion[state.anchor]
     aim = jax.vmap(rotate, in_axes=(0, None))(turned, jnp.array([0.0, 1.0, 0.0]))
     away = lateral - jax.vmap(locate)(state.body, turned).lateral

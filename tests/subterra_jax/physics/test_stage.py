@@ -130,7 +130,7 @@ MOTION = Physical(lidar_place=b2.LIDAR)
 
 
 def moment(params, quaternion, offset):
-    """What LiDARs are shown of a robot that far from its anchor."""
+    """Return the state that LiDARs see of a robot at an offset from its anchor, m."""
     body = SimpleNamespace(qpos=jnp.concatenate([offset, quaternion, jnp.zeros(12)]))
     ride, position = SimpleNamespace(body=body, anchor=jnp.int32(ANCHOR)), params.track.position[ANCHOR, :2]
     station = params.track.station[ANCHOR]

@@ -1,4 +1,4 @@
-"""What the recorder adds to an episode: poses in three dimensions, an IMU; known answers."""
+"""Poses in three dimensions and an IMU, which the recorder adds to an episode: known answers."""
 
 import dataclasses
 from types import SimpleNamespace
