@@ -64,6 +64,23 @@ def test_brackets_stand_every_metre_with_an_arm_a_tier_and_one_door_at_half_the_
     assert count["furniture_niche"] == 1
 
 
+@pytest.mark.parametrize(
+    ("kind", "size"),
+    [
+        ("lamp", (1.2, 0.18, 0.10)), ("hectometre_plate", (0.5, 0.03, 0.30)), ("third_rail", (3.0, 0.08, 0.10)),
+        ("third_rail_cover", (3.0, 0.16, 0.02)), ("insulator", (0.10, 0.10, 0.22)), ("bracket", (0.05, 0.05, 1.3)),
+    ],
+)  # fmt: skip
+def test_pieces_have_their_sizes_and_lamps_hang_4_cm_under_the_crown(level, laid, kind, size):
+    pieces = [piece for piece in furnish_bore(level, laid, WITH_DOOR).pieces if piece.kind == kind]
+    for piece in pieces:
+        np.testing.assert_allclose(2 * piece.half, size, atol=0.02)
+        if kind == "lamp":
+            under = level.toward(np.pi / 2)[0] - level.axis.local(piece.corners())[2].max()
+            assert under == pytest.approx(0.04, abs=2e-3)
+    assert pieces
+
+
 def test_every_kind_can_be_left_out(level, laid):
     kinds = {"walkway", "handrail", "cables", "third_rail", "plates", "passage", "lamps"}
     none = FurnitureConfig(**dict.fromkeys(kinds, False))
@@ -177,8 +194,24 @@ def test_texture_coordinates_run_once_around_without_a_jump_inside_a_face(bore, 
 
 
 def test_stations_of_surveyed_rings_are_no_joints(bore):
-    from dataclasses import replace
-
     assert has_rings(replace(bore, ring_station=np.arange(1.0, 20.0, 1.5)))
     assert not has_rings(replace(bore, ring_station=np.arange(1.0, 24.0, 5.0)))
     assert not has_rings(replace(bore, ring_station=np.empty(0)))
+
+
+def test_cameras_stand_in_both_portals_and_the_middle_and_the_rover_two_metres_in(bore, dressed):
+    laid, _, model = dressed
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    seen = [data.cam(name) for name in ("portal_start", "middle", "wall", "portal_end")]
+    place = np.array([*(camera.xpos for camera in seen), data.body("scout").xpos])
+    station, aside, _ = bore.axis.local(place)
+    above = place[:, 2] - np.interp(station, bore.station, laid.elevation)
+    half = bore.length / 2
+    np.testing.assert_allclose(station, [1.0, half, half, bore.length - 1.0, 2.0], atol=0.05)
+    np.testing.assert_allclose(aside, [0.0, 0.9, 1.0, 0.0, 0.0], atol=0.01)
+    np.testing.assert_allclose(above[:4], [1.9, 1.7, 1.6, 1.9], atol=0.01)
+    at = bore.axis.at(station[:4])
+    look = [-camera.xmat.reshape(3, 3)[:, 2] for camera in seen]
+    np.testing.assert_allclose(np.einsum("ij,ij->i", look, at.tangent), [1.0, 1.0, 0.507, -1.0], atol=0.01)
+    assert look[2] @ at.lateral[2] == pytest.approx(-0.862, abs=0.01)

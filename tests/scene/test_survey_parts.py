@@ -184,6 +184,12 @@ def test_without_tolerances_a_bore_is_as_designed_and_all_other_draws_stay(bores
     np.testing.assert_array_equal(bores[0].section.width(station), bores[1].section.width(station))
 
 
+def test_a_rail_is_150_mm_wide_at_its_foot_16_at_its_web_and_73_at_its_head(bores) -> None:
+    across, up = bores[0].furniture.rail_half.T
+    width = 2e3 * np.interp([0.006, 0.045, 0.080, 0.115, 0.160], up, across)
+    np.testing.assert_allclose(width, [150.0, 16.5, 16.5, 16.5, 73.0], rtol=1e-6)
+
+
 class Sending(ExitStack):
     """A pool of processes that does nothing with what another process would have to read."""
 

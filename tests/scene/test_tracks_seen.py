@@ -204,6 +204,14 @@ def test_sleepers_of_uneven_pitch_are_not_filled_up():
     assert abs(len(line.sleepers.station) - inside) <= 2
 
 
+def test_a_plank_nearly_as_high_as_the_rails_that_lies_between_them_is_no_sleeper():
+    _, bore = scanned("proud")
+    world = replace(WORLDS["proud"], boxes=[*track(0.22), (0.0, L, -0.15, 0.15, 0.36, 0.38)])
+    cloud = thin(world.scan(railway.os1(), railway.carried(L, 1.4, 0.5), 0.012))
+    (line,) = find_track(cloud, bore).lines
+    assert line.sleepers.protrusion == pytest.approx(0.22, abs=0.015)
+
+
 def test_sleepers_that_nobody_saw_are_said_to_stand_by_the_spacing():
     _cloud, bore = scanned("proud", "terrestrial")
     seen = seen_in("proud", "terrestrial")
