@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack, redirect_stderr, redirect_stdout
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -77,7 +78,7 @@ _DECIDED = {"after": "header", "same clock": "epoch", "other clock": "other cloc
 
 @dataclass(frozen=True)
 class RecordingsConfig:
-    """Writes one drive in many conventions and builds each. Those that `out` has rows of are not built again."""
+    """Writes one drive in many conventions and builds each."""
 
     count: int = 300  # Recordings.
     seed: int = 0  # Draws the drive and the conventions.
@@ -275,7 +276,7 @@ def judge_case(drive: Drive, case: Case, path: Path) -> Row:
 _drives: dict[str, Drive] = {}  # of the forked workers, by sensor
 
 
-def _run(seed: int, k: int, folder: Path) -> Row:
+def _run(seed: int, folder: Path, k: int) -> Row:
     case = draw_case(np.random.default_rng([seed, k]))
     with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
         path = write_case(_drives[case.sensor], case, folder / f"{k}.bag")
@@ -294,7 +295,7 @@ def _control(sensor: Sensor, beside: Beside, folder: Path) -> Bore:
 
 def measure(config: RecordingsConfig) -> list[Row]:
     """Writes, reads and builds all recordings; returns their rows."""
-    known = _known(config.out / "rows.jsonl")
+    rows = list[Row]()
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         pairs: list[tuple[Sensor, Beside]] = [(s, b) for s in ("vlp16", "avia") for b in ("trajectory", "IMU")]
@@ -305,21 +306,13 @@ def measure(config: RecordingsConfig) -> list[Row]:
             for (sensor, beside), bore in zip(pairs, bores, strict=True):
                 _drives[sensor].controls[beside] = bore
         pool = stack.enter_context(ProcessPoolExecutor(config.workers, context))
-        lines = stack.enter_context((config.out / "rows.jsonl").open("a"))
-        left = [k for k in range(config.count) if k not in known]
-        for k, row in zip(left, pool.map(_run, [config.seed] * len(left), left, [folder] * len(left)), strict=True):
-            known[k] = row
-            lines.write(json.dumps({"number": k, **asdict(row)}) + "\n")
-            lines.flush()
+        lines = stack.enter_context((config.out / "rows.jsonl").open("w"))
+        for k, row in enumerate(pool.map(partial(_run, config.seed, folder), range(config.count))):
+            rows.append(row)
+            print(json.dumps({"number": k, **asdict(row)}), file=lines, flush=True)
             if row.outcome in OUTCOMES[3:]:
                 print(f"{k}: {row.outcome}: {row.said}", flush=True)
-    return [known[k] for k in range(config.count)]
-
-
-def _known(path: Path) -> dict[int, Row]:
-    lines = [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
-    cases = [Case(Convention(**line["case"].pop("convention")), **line.pop("case")) for line in lines]
-    return {line.pop("number"): Row(case, **line) for case, line in zip(cases, lines, strict=True)}
+    return rows
 
 
 def properties(row: Row) -> Iterator[str]:
@@ -345,8 +338,6 @@ def run(config: RecordingsConfig) -> int:
     counts = Counter((kind, row.outcome) for row in rows for kind in properties(row))
     kinds = sorted({kind for kind, _ in counts})
     print(markdown_table(("kind", *OUTCOMES), [(kind, *(str(counts[kind, o]) for o in OUTCOMES)) for kind in kinds]))
-    decided = Counter((row.case.convention.point_times, row.decided) for row in rows)
-    print(json.dumps({f"{true} taken for {taken}": n for (true, taken), n in sorted(decided.items())}, indent=1))
     write_records(config.out / "records.json", records_of(config, rows))
     return int(any(row.outcome == "wrong in silence" for row in rows))
 

@@ -56,6 +56,7 @@ class Score:
     ape_turn: float  # RMS error of the attitude, °
     # Distance driven when the error of the station first exceeds 1 m, m; `None` where it never does
     reach: float | None = None
+    late: float | None = None  # How much later the turns show the estimate's clock to be, s; from 10 ms on
 
 
 @dataclasses.dataclass(frozen=True)
@@ -154,7 +155,7 @@ def score_track(track: Track, axis: Axis, alignment: str, name: str) -> tuple[Sc
         axis=axis.source, along_final=float(parts[-1, 0]), along_rms=rms(parts[:, 0]), across_rms=rms(parts[:, 1]),
         up_rms=rms(parts[:, 2]), drift=100.0 * abs(float(parts[-1, 0])) / distance if distance > 0.0 else None,
         ape=rms(np.linalg.norm(error, axis=1)), ape_turn=rms(np.degrees(turn)),
-        reach=reach_of(travelled, parts[:, 0]),
+        reach=reach_of(travelled, parts[:, 0]), late=track.late,
     )  # fmt: skip
     return score, Curve(travelled, parts)
 
@@ -233,7 +234,7 @@ def _pairs(folder: Path, truth: Path) -> list[tuple[Path, Path]]:
 
 HEAD = (
     "recording", "program", "driven, m", "covered %", "along at the end, m", "drift %", "along, m", "across, m",
-    "up, m", "APE, m", "APE, °",
+    "up, m", "APE, m", "APE, °", "clock late, s",
 )  # fmt: skip
 
 
@@ -249,7 +250,7 @@ def as_rows(scores: list[ProgramScore]) -> list[tuple[str, ...]]:
         rows.append((
             s.name, one.program, cell(s.distance, 1), cell(100.0 * s.covered, 0), f"{s.along_final:+.2f}",
             cell(s.drift), cell(s.along_rms, 3), cell(s.across_rms, 3), cell(s.up_rms, 3), cell(s.ape, 3),
-            cell(s.ape_turn, 2),
+            cell(s.ape_turn, 2), cell(s.late, 3),
         ))  # fmt: skip
     return rows
 
@@ -258,7 +259,8 @@ def as_markdown(scores: list[ProgramScore]) -> str:
     """Returns the table with a note on its columns."""
     first = scores[0].score
     return markdown_table(HEAD, as_rows(scores)) + (
-        f"\nRoot mean squares over the recording, alignment `{first.alignment}`; APE is that of `evo`.\n"
+        f"\nRoot mean squares over the recording, alignment `{first.alignment}`; APE is that of `evo`. A clock is "
+        "late where turns of estimate and truth agree best so; errors stand as they are.\n"
     )
 
 

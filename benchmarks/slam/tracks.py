@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.command import BenchmarkError
 from scene.errors import RecordingError
+from scene.poses.clocks import NOTICED, LidarTurns, find_lag, turns_of_poses
 from scene.poses.trajectory import Trajectory, load_tum
 
 _HEADER = "station,x,y,z"
@@ -95,6 +96,7 @@ def _frames(line: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
 
 Alignment = Literal["origin", "se3", "none"]
 ALIGNMENTS = ("origin", "se3", "none")
+_TURNS = 3000  # of an estimate that tell its clock
 _SLACK = 1e-3  # s: a stamp this far outside the truth's span still counts as its end
 
 
@@ -108,6 +110,7 @@ class Track:
     true_position: Float[np.ndarray, "n 3"]  # True positions, m
     true_rotation: Rotation  # True attitudes, `n` of them
     covered: float  # Share of the truth's duration between the first and the last of these times
+    late: float | None = None  # By how much the turns show the estimate's clock to be late, s; from 10 ms on
 
     @property
     def travelled(self) -> Float[np.ndarray, " n"]:
@@ -133,7 +136,10 @@ def read_track(estimate: Path, truth: Path, alignment: Alignment = "origin") -> 
         both = load_tum(estimate), load_tum(truth)
     except RecordingError as error:
         raise BenchmarkError(str(error)) from error
-    return align(_pair(*both), alignment)
+    turns, at = [turns_of_poses(poses) for poses in both], both[0].times[:: len(both[0].times) // _TURNS + 1]
+    lag, _ = find_lag(LidarTurns(at[:-1], at[1:], turns[0](at[:-1], at[1:])), turns[1])
+    late = None if lag is None or abs(lag) < NOTICED else -lag
+    return dataclasses.replace(align(_pair(*both), alignment), late=late)
 
 
 def _pair(estimated: Trajectory, true: Trajectory) -> Track:

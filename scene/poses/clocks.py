@@ -104,7 +104,7 @@ def find_lag(lidar: LidarTurns, other: Turns) -> tuple[float | None, float]:
         return _agreement(own, _even(other(lidar.start + lag, lidar.end + lag)))
 
     near = max(np.arange(-_REACH, _REACH + _COARSE, _COARSE), key=agree)
-    best = max(near + _STEP * np.arange(-4, 5), key=agree)
+    best = max(np.arange(near - _COARSE, near + _COARSE, _STEP), key=agree)
     before, here, after = (agree(best + side) for side in (-_STEP, 0.0, _STEP))
     if here < _AGREE or abs(best) >= _REACH:
         return None, here
@@ -164,7 +164,7 @@ def settle(recording: Recording, other: Timed, auto: bool) -> tuple[Clock, Timed
         of, turns = f"the IMU {other.topic}", turns_of_gyro(other)
     else:
         of, turns = f"the trajectory {other.path.name}", turns_of_poses(other)
-    apart = _apart(recording, of, other.times, auto)
+    apart = find_gap(recording, of, other.times, auto)
     lag, agreement = _lag(recording, lambda start, end: turns(start + apart, end + apart))
     offset = None if lag is None and not apart else apart + (lag or 0.0)
     if offset is None or abs(offset) < NOTICED:
@@ -188,8 +188,11 @@ def _lag(recording: Recording, other: Turns) -> tuple[float | None, float]:
     return (None, np.nan) if lidar is None else find_lag(lidar, other)
 
 
-def _apart(recording: Recording, of: str, times: Float[np.ndarray, " n"], auto: bool) -> float:
-    """Return how far the beginnings of two clocks are apart that share no time, s; 0 where they do."""
+def find_gap(recording: Recording, of: str, times: Float[np.ndarray, " n"], auto: bool) -> float:
+    """Return how far the beginnings of two clocks are apart that share no time, s; 0 where they do.
+
+    Raises `RecordingError` where they share none, and not `auto`.
+    """
     begin, end = float(recording.stamps.min()), float(recording.stamps.max())
     first, last = float(times[0]), float(times[-1])
     if min(end, last) - max(begin, first) >= _OVERLAP * min(end - begin, last - first):

@@ -16,14 +16,14 @@ from scene.cloud import Cloud
 from scene.errors import RecordingError
 from scene.inputs import hash_inputs
 from scene.poses.calibration import Calibration, Mount
-from scene.poses.clocks import NOTICED, Clock, settle
+from scene.poses.clocks import NOTICED, Clock, find_gap, settle
 from scene.poses.consistency import check_poses, reorder
 from scene.poses.imu import Inertial, find_inertial, gyro_guide, level_rotation
 from scene.poses.odometry import LIBRARY, Guide, estimate_odometry
 from scene.poses.registration import register_scans
 from scene.poses.smoother import Noise, Problem, find_control_lag, imu_steps, inertial_problem, solve_with_heading
 from scene.poses.terms import Chain
-from scene.poses.trajectory import MIN_CONTROL_SHARE, Control, Trajectory, load_control, load_tum
+from scene.poses.trajectory import Control, Trajectory, load_control, load_tum
 from scene.progress import Stages
 from scene.reading.cloudfile import read_cloud
 from scene.reading.formats import ReadingConfig, describe, left_out
@@ -86,6 +86,7 @@ def locate_by_odometry(recording: Recording, calibration: Calibration, progress:
 # Guides: what is trusted of the turn (rad) and the shift (m) from one sweep to the next.
 _BY_CONTROL = (np.deg2rad(0.1), 0.02)
 _OUTLIER = 4.0  # standard deviations
+_MOST_WITHOUT_CONTROL = 0.5  # share of the scans
 _END_ERROR = 0.05  # m; an end of the bore is found to this, on simulated surveys
 
 
@@ -101,10 +102,11 @@ def locate_by_control(
     Raises `RecordingError` where the control does not overlap the recording or no IMU is known, and `FitError` for too
     few scans, or where the measurements do not determine the trajectory.
     """
-    times = recording.stamps
-    if len(times) < 2:
-        raise RecordingError(f"{recording.path}: holds {len(times)} scans; at least 2 are needed")
-    control.require_overlap(times[0], times[-1], recording.path)
+    if recording.scan_count < 2:
+        raise RecordingError(f"{recording.path}: holds {recording.scan_count} scans; at least 2 are needed")
+    of = f"the control {control.path.name}"
+    apart = find_gap(recording, of, control.times, auto)
+    control = replace(control, times=control.times - apart)
     inertial, mount, clock = _find_timed(recording, calibration, auto)
     if inertial is None or mount is None or clock is None:
         raise RecordingError(
@@ -116,12 +118,12 @@ def locate_by_control(
     lever = mount.rotation @ calibration.prism + mount.shift
     problem, guess = _guess(progress, inertial, control, lever)
     lag = find_control_lag(problem, guess, control)
-    corrected = bool(auto and lag is not None and abs(lag) >= NOTICED)
+    corrected = auto and lag is not None and abs(lag) >= NOTICED
     if corrected:
         control = replace(control, times=control.times - lag)
         problem, guess = _guess(progress, inertial, control, lever)
     late = 0.0 if clock.corrected else clock.offset or 0.0  # of the IMU, against the LiDAR
-    of_control = Clock(f"the control {control.path.name}", None if lag is None else lag + late, corrected)
+    of_control = Clock(of, None if lag is None else lag + late + apart, corrected or apart != 0.0)
     doubts = [words for words in (clock.words, of_control.words) if words]
     stage = progress.start("LiDAR odometry", recording.scan_count)
     odometry = estimate_odometry(recording, Guide(_lidar_poses(guess, mount), True, *_BY_CONTROL), stage)
@@ -136,12 +138,12 @@ def locate_by_control(
             "prism_lever": calibration.prism,
             **clock.facts,
             "control_clock_offset": of_control.offset,
-            "control_clock_corrected": corrected,
+            "control_clock_corrected": of_control.corrected,
             "clock_doubt": "; ".join(doubts) or None,
             **_control_facts(problem, chain, control),
         },
         # Control often starts late and ends early; what it does not reach is left out, and counted.
-        most_uncovered=1 - MIN_CONTROL_SHARE,
+        most_uncovered=_MOST_WITHOUT_CONTROL,
     )
 
 

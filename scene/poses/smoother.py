@@ -149,7 +149,7 @@ def find_control_lag(problem: Problem, chain: Chain, control: Control) -> float 
         bend = before - 2.0 * here + after
         within = here <= min(before, after) and bend > _TELLS
         best += float(0.5 * step * (before - after) / bend if within else step * np.sign(before - after))
-    return best if here < most and within else None
+    return float(best) if here < most and within else None
 
 
 _KNOT_STEP = 0.025  # s; between two knots a walker's motion is straight to 0.2 mm and 0.005°

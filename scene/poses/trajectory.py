@@ -108,7 +108,6 @@ def load_tum(path: Path) -> Trajectory:
 
 MIN_CONTROL_ROWS = 10  # of a control within the recording
 _MIN_CONTROL_EXTENT = 3.0  # m; less than a bore is wide, and no heading comes of it
-MIN_CONTROL_SHARE = 0.5  # of the recording's time
 
 
 @dataclass(frozen=True)
@@ -119,19 +118,6 @@ class Control:
     positions: Float[np.ndarray, "n 3"]  # m
     path: Path  # The file
     dropped: int  # Rows left out because their time was repeated
-
-    def require_overlap(self, start: float, end: float, recording: Path) -> None:
-        """Refuses control that shares less than half of a recording's time, from `start` to `end`, s.
-
-        Raises `RecordingError`.
-        """
-        first, last = float(self.times[0]), float(self.times[-1])
-        shared = max(min(end, last) - max(start, first), 0.0)
-        if shared < MIN_CONTROL_SHARE * (end - start):
-            raise RecordingError(
-                f"{self.path}: control runs from {first:.2f} to {last:.2f} s, but {recording} from {start:.2f} to "
-                f"{end:.2f} s; they share {shared:.1f} s, and {MIN_CONTROL_SHARE:.0%} of the recording is needed"
-            )
 
 
 def load_control(path: Path) -> Control:

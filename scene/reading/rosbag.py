@@ -22,8 +22,9 @@ from scene.reading.scans import (
     POINTCLOUD2_TYPE,
     RawScan,
     ScanSource,
+    cloud_records,
     parse_custom_msg,
-    parse_pointcloud2,
+    scan_from_records,
 )  # fmt: skip
 from scene.reading.source import cause, one_line, refuse_damage
 
@@ -154,7 +155,7 @@ class RosBag(ScanSource):
             except Exception as error:
                 raise ValueError(f"not a whole PointCloud2: {cause(error)}") from error
             stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
-            scan = parse_pointcloud2(message, stamp)
+            scan = scan_from_records(stamp, cloud_records(message))
         return replace(scan, received=received)
 
     def _choose(self, topic: str | None) -> tuple[list[Any], list[str]]:

@@ -128,16 +128,11 @@ POINTCLOUD2_TYPE = "sensor_msgs/msg/PointCloud2"
 _FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
 
-def parse_pointcloud2(message: Any, stamp: float) -> RawScan:
-    """Parses a deserialised message with the stamp of its header, s.
+def cloud_records(message: Any) -> Shaped[np.ndarray, " n"]:
+    """Return the points of a PointCloud2 as records of x, y, z and any time, without padding at the end of rows.
 
     Raises `ValueError` without coordinates, or for a layout that contradicts itself.
     """
-    return scan_from_records(stamp, cloud_records(message))
-
-
-def cloud_records(message: Any) -> Shaped[np.ndarray, " n"]:
-    """Return the points as records of x, y, z and any time, without padding at the end of rows."""
     width, height, step, row = message.width, message.height, message.point_step, message.row_step
     if not width * height:
         return np.empty(0, [("x", "f4"), ("y", "f4"), ("z", "f4")])

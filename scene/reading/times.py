@@ -34,6 +34,7 @@ _SAMPLE = 4000  # points of a sweep by which its span is found
 _MOST, _AROUND = 0.85, 3.0  # share of the points that lie about the median; how much further a time of theirs may lie
 _LONG = 0.95  # quantile of the spans of all sweeps that is the length of one: of some the first or last beams are lost
 _COUNTER = 2.0**32  # values of a counter of 32 bits
+_LIKE = 0.1  # of the spread that a share of a sweep has: times with less of it are alike
 _FARTHEST = 1e7  # m; no sensor sees so far
 _FLAG = tyro.conf.arg(prefix_name=False)
 
@@ -178,17 +179,19 @@ def join_scans(parts: list[Scan]) -> Scan:
 def _unwrap(values: Shaped[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
     """Return times as float64, and which are of the sweep: counters of 32 bits may pass their end within one.
 
-    A few values across that end are no sign of it: an underflow made them.
+    Neither a few values across that end nor many alike are a sign of it: an underflow made them.
     """
     times = values.astype(np.float64)
     good = np.isfinite(times)
     if _counts_32(values) and len(values):
         ahead = times - np.median(times)
         early, late = ahead < -0.5 * _COUNTER, ahead > 0.5 * _COUNTER
-        if (early | late).mean() > MOST_BAD:
+        across = early | late
+        share = float(across.mean())
+        if share > MOST_BAD and times[across].std() > _LIKE * share * times[~across].std():
             times = times + _COUNTER * early - _COUNTER * late
         else:
-            good = ~(early | late)
+            good = ~across
     return times, good
 
 

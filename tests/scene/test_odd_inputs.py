@@ -1,6 +1,5 @@
 """Well-formed and unusual files: what is no return is left out and counted, splits are read, packed ones named."""
 
-import gzip
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
@@ -17,12 +16,11 @@ from scene.errors import Code, RecordingError
 from scene.judging.judge import Warned
 from scene.limits import list_limits
 from scene.reading.cloudfile import read_cloud
-from scene.reading.formats import ReadingConfig, detect
+from scene.reading.formats import ReadingConfig
 from scene.reading.recording import Recording
 from scene.writing.folder import SCENES, state_crs
 from tests.scene.bags import write_bag
 from tests.scene.conventions import sweeps, write_convention
-from tests.scene.messages import PLAIN, pointcloud2, write_bag1
 
 XYZ = np.random.default_rng(0).uniform(1, 9, (500, 3))
 WKT = 'PROJCS["ETRS89 / UTM zone 33N",GEOGCS["ETRS89",UNIT["degree",0.0174]],UNIT["metre",1],AUTHORITY["EPSG","25833"]]'
@@ -53,24 +51,6 @@ def test_withheld_points_and_noise_are_left_out_and_counted_unless_kept(tmp_path
     cloud, facts = read_cloud(path, 0.001, ReadingConfig(keep_noise=True))
     assert "points_left_out" not in facts
     assert cloud.returns == len(XYZ)
-
-
-def test_the_crs_of_a_las_file_is_kept(tmp_path):
-    assert read_cloud(write_las(tmp_path / "a.las", XYZ, crs=WKT), 0.01)[1]["crs"] == WKT
-    assert "crs" not in read_cloud(write_las(tmp_path / "b.las", XYZ), 0.01)[1]
-
-
-def test_points_of_an_e57_in_the_scanner_itself_are_no_returns(tmp_path):
-    pye57 = pytest.importorskip("pye57")
-    some = XYZ.copy()
-    some[::2] = 0.0
-    with pye57.E57(str(tmp_path / "a.e57"), mode="w") as file:
-        columns = dict(zip(("cartesianX", "cartesianY", "cartesianZ"), some.T.copy(), strict=True))
-        file.write_scan_raw(columns, translation=np.array([100.0, 0.0, 0.0]))
-    cloud, facts = read_cloud(tmp_path / "a.e57", 0.001)
-    assert facts["points_left_out"] == {"no_return": 250}
-    assert cloud.returns == 250
-    assert (cloud.points + cloud.origin)[:, 0].min() > 100.5
 
 
 def ptx(points, place, rows=50, matrix=None) -> str:
@@ -112,12 +92,6 @@ def test_a_damaged_ptx_is_named_with_its_line(tmp_path, change, said):
         read_cloud(path, 0.01)
 
 
-def test_a_pts_is_read_behind_its_count(tmp_path):
-    rows = "\n".join(f"{x:.4f} {y:.4f} {z:.4f} 100 1 2 3" for x, y, z in XYZ)
-    (tmp_path / "a.pts").write_text(f"{len(XYZ)}\n{rows}\n")
-    assert read_cloud(tmp_path / "a.pts", 0.001)[0].returns == len(XYZ)
-
-
 def split(tmp_path):
     """The bags of one drive, whose names do not tell their order."""
     whole = [(start, points) for start, points, _ in sweeps(9)]
@@ -150,16 +124,6 @@ def test_several_bags_on_the_command_line_are_one_recording(tmp_path):
         Recording(bags[0], more=(cloud,))
 
 
-@pytest.mark.parametrize("name", ["a.bag.gz", "a.mcap.zstd", "a.bag.zst"])
-def test_a_packed_recording_says_how_it_is_unpacked(tmp_path, name):
-    raw = write_convention(tmp_path / "a.bag").read_bytes()
-    path = tmp_path / name
-    path.write_bytes(gzip.compress(raw) if name.endswith("gz") else b"\x28\xb5\x2f\xfd" + raw)
-    tool = "gzip" if name.endswith("gz") else "zstd"
-    with pytest.raises(RecordingError, match=rf"is compressed; decompress it first: {tool} -d {name}"):
-        detect(path)
-
-
 def test_a_bag_whose_index_was_never_written_says_so(tmp_path):
     raw = bytearray(write_convention(tmp_path / "a.bag").read_bytes())
     place = raw.index(b"index_pos=") + len(b"index_pos=")
@@ -167,20 +131,6 @@ def test_a_bag_whose_index_was_never_written_says_so(tmp_path):
     (tmp_path / "b.bag").write_bytes(raw)
     with pytest.raises(RecordingError, match=r"b\.bag: not a whole ROS1 bag.*reindex before reading"):
         Recording(tmp_path / "b.bag")
-
-
-def test_two_lidars_in_one_bag_are_asked_for(tmp_path):
-    rows = [
-        (start, pointcloud2(start, PLAIN, 12, dict(zip("xyz", points.T, strict=True))))
-        for start, points, _ in sweeps(3)
-    ]
-    bag = write_bag1(tmp_path / "a.bag", {"/lidar_front/points": rows, "/lidar_rear/points": rows, "/map": rows})
-    with pytest.raises(
-        RecordingError, match=r"a\.bag: holds 2 LiDARs, /lidar_front/points, /lidar_rear/points; --topic"
-    ):
-        Recording(bag)
-    with Recording(bag, topic="/lidar_rear/points") as recording:
-        assert recording.topic == "/lidar_rear/points"
 
 
 def test_every_file_that_can_hold_one_has_the_crs_of_the_input(tmp_path):

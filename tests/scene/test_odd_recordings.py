@@ -85,7 +85,10 @@ CONTROL = {
     "NaN": (np.column_stack([np.arange(40.0), np.full((40, 3), np.nan)]), "row 1 is not finite"),
     "five numbers": (np.ones((40, 5)), "control has rows of 4 or 8 numbers"),
     "in one place": (np.column_stack([np.arange(40.0), np.ones((40, 3))]), "all positions lie within 0.00 m"),
-    "milliseconds": (np.column_stack([5000 + 100 * np.arange(40.0)] + [np.arange(40.0)] * 3), "they share 0.0 s"),
+    "milliseconds": (
+        np.column_stack([5000 + 100 * np.arange(40.0)] + [np.arange(40.0)] * 3),
+        "are 4995 s apart",
+    ),
 }
 
 

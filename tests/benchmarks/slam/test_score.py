@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.command import BenchmarkError
 from benchmarks.slam.__main__ import command
-from benchmarks.slam.score import score_files
+from benchmarks.slam.score import HEAD, ProgramScore, as_rows, score_files
 from tests.benchmarks.slam.tracks import bend, line, write_axis, write_tum
 
 MOVE = Rotation.from_rotvec([0.1, -0.2, 1.9]), np.array([40.0, -7.0, 3.0])
@@ -224,3 +224,14 @@ def test_a_bad_axis_or_standstill_is_refused(tmp_path):
         score_files(still, still)
     with pytest.raises(BenchmarkError, match="no alignment 'scale'"):
         score_files(truth, truth, alignment="scale")
+
+
+def test_an_estimate_whose_clock_is_late_has_the_offset_in_a_column_of_its_own(tmp_path):
+    time, position, rotation = bend()
+    sway = rotation * Rotation.from_rotvec(0.05 * np.column_stack([np.sin(5 * time), np.cos(3 * time), np.sin(time)]))
+    truth = write_tum(tmp_path / "truth.tum", time, position, sway)
+    late = score_files(write_tum(tmp_path / "late.tum", time + 0.05, position, sway), truth)[0]
+    assert late.late == pytest.approx(0.05, abs=3e-3)
+    assert late.ape > 0.02, "the errors stand without it"
+    assert as_rows([ProgramScore("mine", late)])[0][HEAD.index("clock late, s")] == "0.050"
+    assert score_files(truth, truth)[0].late is None

@@ -1,0 +1,142 @@
+"""Well-formed, unusual inputs by the command: each is built as it was, or refused for its true reason."""
+
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pye57 import E57
+
+from benchmarks.recordings import Case, Drive, RecordingsConfig, drive_through, write_case
+from scene.build import main
+from scene.survey.messages import Convention
+from tests.scene.clouds import curved_d_bore
+from tests.scene.conventions import sweeps
+from tests.scene.messages import PLAIN, pointcloud2, write_bag1
+from tests.scene.test_odd_inputs import WKT, ptx, write_las
+
+pytestmark = pytest.mark.usefixtures("silent")
+POINTS = curved_d_bore(length=14.0, per_metre=3000, offset=(1.0, 2.0, 0.5)).points
+TEXT = "".join("{:.4f} {:.4f} {:.4f} 9 1 2 3\n".format(*row) for row in POINTS)
+SOUND = {"clock_doubt": None, "pose_doubt": None}
+
+
+@dataclass(frozen=True)
+class Row:
+    """What a user has, says, and is answered."""
+
+    write: Callable[[Path, Drive], Path]
+    said: str  # part of what is printed
+    words: str = "--trajectory {truth}"
+    status: int = 0
+    facts: dict[str, Any] = field(default_factory=dict)  # of the manifest
+
+
+def drive(**how: Any) -> Callable[[Path, Drive], Path]:
+    def write(folder: Path, one: Drive) -> Path:
+        return write_case(one, Case(Convention(**how), "vlp16", "trajectory", 0.0), folder / "a.bag")
+
+    return write
+
+
+def boot(unit: str, since: float) -> Callable[[Path, Drive], Path]:
+    return drive(point_times="boot", point_unit=unit, boot=since, header_of="end")
+
+
+def write_e57(folder: Path, _: Drive) -> Path:
+    rows = POINTS.copy()
+    rows[::2] = 0.0
+    with E57(str(folder / "a.e57"), mode="w") as file:
+        columns = dict(zip(("cartesianX", "cartesianY", "cartesianZ"), rows.T.copy(), strict=True))
+        file.write_scan_raw(columns, translation=np.array([100.0, 0.0, 0.0]))
+    return folder / "a.e57"
+
+
+def write_laz(folder: Path, _: Drive) -> Path:
+    """A tenth of the points in a film 0.3 m before the walls, marked as withheld, and two of noise."""
+    film = (POINTS[::10] - POINTS.mean(axis=0)) * [1.0, 1.0, 0.9] + POINTS.mean(axis=0)
+    return write_las(folder / "a.laz", np.concatenate([POINTS, film]), range(len(POINTS), len(POINTS) + len(film)),
+                     (3, 4), WKT)  # fmt: skip
+
+
+def file(name: str, content: bytes) -> Callable[[Path, Drive], Path]:
+    def write(folder: Path, _: Drive) -> Path:
+        (folder / name).write_bytes(content)
+        return folder / name
+
+    return write
+
+
+def small(topics: tuple[str, ...], **times: float) -> Callable[[Path, Drive], Path]:
+    """A few sweeps on each topic, with times of a scale."""
+
+    def write(folder: Path, _: Drive) -> Path:
+        fields = [*PLAIN, ("time", "f4", 12)] if times else PLAIN
+        rows = [(at, pointcloud2(at, fields, 16, dict(zip("xyz", xyz.T, strict=True))
+                                 | {name: scale * since for name, scale in times.items()}))
+                for at, xyz, since in sweeps(12)]  # fmt: skip
+        return write_bag1(folder / "a.bag", dict.fromkeys(topics, rows))
+
+    return write
+
+
+CONTROL = "--control {prism} --calibration {mounts}"
+OTHER = "by another clock, {}; sweeps of 0.05"
+ROWS = {
+    "ns since boot in floats": Row(boot("ns", 320.0), OTHER.format("ns"), facts=SOUND),
+    "s since boot": Row(boot("s", 320.0), OTHER.format("s"), facts=SOUND | {"quaternions": "xyzw (by default)"}),
+    "s since boot, quaternions given": Row(
+        boot("s", 1500.0), OTHER.format("s"), "--trajectory {truth} --quaternion xyzw",
+        facts=SOUND | {"quaternions": "xyzw (by flag)"}),
+    "s since boot, hours ago": Row(boot("s", 3e4), OTHER.format("s"), facts=SOUND),
+    "s since boot, just now": Row(boot("s", 5.0), OTHER.format("s"), facts=SOUND),
+    "times that underflow": Row(
+        drive(point_times="header", point_unit="ns", point_type="u4", bad_times=0.001),
+        "points without a time of their sweep", facts=SOUND),
+    "an IMU 0.1 s late": Row(drive(imu_late=0.1), "the clock of the IMU /imu/data is 0.1", CONTROL, 2),
+    "an IMU 0.1 s late, set right": Row(
+        drive(imu_late=0.1), "", CONTROL + " --clock auto", facts=SOUND | {"clock_corrected": True}),
+    "an IMU 0.7 s late": Row(drive(imu_late=0.7), "the clock of the IMU /imu/data is 0.7", CONTROL, 2),
+    "an IMU years late": Row(drive(imu_late=-2e8), "their clocks are -2e+08 s apart; --clock auto", CONTROL, 2),
+    "a prism years late, set right": Row(
+        drive(), "", CONTROL.replace("{prism}", "{late}") + " --clock auto",
+        facts=SOUND | {"control_clock_offset": pytest.approx(2e8, abs=0.02), "control_clock_corrected": True}),
+    "a folder of bags": Row(drive(bags=3), "s before the stamp (its end)", facts=SOUND | {"bags": 3}),
+    "gzip": Row(file("a.bag.gz", b"\x1f\x8b"), "is compressed; decompress it first: gzip -d a.bag.gz", "", 2),
+    "zstd": Row(file("a.mcap.zst", b"\x28\xb5\x2f\xfd"), "decompress it first: zstd -d a.mcap.zst", "", 2),
+    "E57, half of it in the scanner": Row(write_e57, "left out: 21,000 points (no return)", ""),
+    "LAZ, points withheld, noise": Row(write_laz, "4,200 points (withheld), 2 points (noise)", "", facts={"crs": WKT}),
+    "PTX": Row(file("a.ptx", ptx(POINTS - 50.0, (50.0, 50.0, 50.0)).encode()), "format PTX", ""),
+    "PTS": Row(file("a.pts", f"{len(POINTS)}\n{TEXT}".encode()), "registered cloud", ""),
+    "two LiDARs": Row(small(("/front/points", "/rear/points", "/map")),
+                      "holds 2 LiDARs, /front/points, /rear/points; --topic says which", "", 2),
+    "times of two readings": Row(small(("/points",), time=2.5), "fit two readings: s, sweeps of 0.245 s, or ms", "", 2),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def known(tmp_path_factory) -> Drive:
+    one = drive_through(RecordingsConfig(), tmp_path_factory.mktemp("drive"), "vlp16")
+    np.savetxt(one.prism.with_name("late.tum"), np.loadtxt(one.prism) + 2e8 * np.eye(1, 8), fmt="%.9f")
+    return one
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_a_row_of_the_table_ends_as_it_should(name, known, tmp_path, monkeypatch, capsys):
+    row, out = ROWS[name], tmp_path / "scene"
+    truth, late = known.mounts.with_suffix(".tum"), known.prism.with_name("late.tum")
+    words = row.words.format(truth=truth, prism=known.prism, late=late, mounts=known.mounts)
+    path = row.write(tmp_path, known)
+    monkeypatch.setattr(sys, "argv", ["scene.build", str(path), *words.split(), "--out", str(out)])
+    assert main() == row.status
+    said = capsys.readouterr()
+    assert row.said in said.out + said.err
+    assert ("error" in said.err) == (said.err.count("\n") == 1) == (row.status == 2)
+    assert out.exists() == (row.status == 0)
+    if row.status == 0:
+        manifest = json.loads((out / "manifest.json").read_text())
+        assert row.facts.items() <= manifest["detected"].items()
