@@ -33,7 +33,6 @@ def drives(tmp_path_factory):
 
 
 CASES = {
-    "as its driver has it": (Case(Convention(), "vlp16", "trajectory", 0.0), "as control"),
     "since boot, headers at the end, a trajectory that is late": (
         Case(Convention("boot", "ns", header_of="end", bags=2), "vlp16", "trajectory", 0.4), "as control"),
     "since boot, 32 bits, an IMU that is early": (
@@ -41,8 +40,6 @@ CASES = {
     "constant, beside a trajectory": (Case(Convention("constant"), "vlp16", "trajectory", 0.0), "static, as said"),
     "too many bad times": (
         Case(Convention("header", "us", bad_times=0.1), "vlp16", "trajectory", 0.0), "refused, true reason"),
-    "Livox' own message in ROS 2": (
-        Case(Convention(container="mcap", bags=2), "avia", "trajectory", 0.3), "as control"),
     "half sweeps of a Livox, NaN where nothing came back": (
         Case(Convention("epoch", "ns", empty="nan", pieces=2, missing=0.02), "avia", "trajectory", 0.0), "as control"),
 }  # fmt: skip

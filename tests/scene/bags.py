@@ -6,23 +6,9 @@ import numpy as np
 from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_typestore
 
+from scene.survey.messages import CUSTOM_DEFINITION, CUSTOM_TYPE
+
 MD5 = "e4d6829bdfe657cb6c21a746c86b21a6"
-DEFINITION = """std_msgs/Header header
-uint64 timebase
-uint32 point_num
-uint8 lidar_id
-uint8[3] rsvd
-CustomPoint[] points
-================================================================================
-MSG: livox_ros_driver/CustomPoint
-uint32 offset_time
-float32 x
-float32 y
-float32 z
-uint8 reflectivity
-uint8 tag
-uint8 line
-"""
 
 
 def custom_msg(stamp: float, points: np.ndarray, span: float = 0.1, tag: int = 0x10) -> bytes:
@@ -40,22 +26,23 @@ def custom_msg(stamp: float, points: np.ndarray, span: float = 0.1, tag: int = 0
 def write_bag(path: Path, scans: list[tuple[float, np.ndarray]], topic: str = "/livox/lidar") -> Path:
     """A bag with one LiDAR topic."""
     with Writer(path) as writer:
-        connection = writer.add_connection(topic, "livox_ros_driver/msg/CustomMsg", msgdef=DEFINITION, md5sum=MD5)
+        connection = writer.add_connection(topic, CUSTOM_TYPE, msgdef=CUSTOM_DEFINITION, md5sum=MD5)
         for stamp, points in scans:
             writer.write(connection, int(stamp * 1e9), custom_msg(stamp, points))
     return path
 
 
-def write_imu_bag(path: Path, points: np.ndarray, count: int) -> Path:
-    """A bag with one sweep and `count` samples of `/livox/imu` at 200 Hz, at rest and in g."""
+def write_imu_bag(path: Path, points: np.ndarray, count: int, sample=lambda k: ([0.01, 0, 0.1], [0, 0, 1])) -> Path:
+    """A bag with one sweep and `count` samples of `/livox/imu` at 200 Hz: rate and force, at rest and in g."""
     store = get_typestore(Stores.ROS1_NOETIC)
     with Writer(path) as writer:
-        lidar = writer.add_connection("/livox/lidar", "livox_ros_driver/msg/CustomMsg", msgdef=DEFINITION, md5sum=MD5)
+        lidar = writer.add_connection("/livox/lidar", CUSTOM_TYPE, msgdef=CUSTOM_DEFINITION, md5sum=MD5)
         writer.write(lidar, int(5e9), custom_msg(5.0, points))
         imu = writer.add_connection("/livox/imu", "sensor_msgs/msg/Imu", typestore=store)
         for k in range(count):
-            head = np.array([k, 5, 5_000_000 * k, 5], "<u4").tobytes() + b"livox"
-            numbers = np.concatenate([[0.0, 0, 0, 1], np.zeros(9), [0.01, 0, 0.1], np.zeros(9), [0, 0, 1], np.zeros(9)])
+            (rate, force), none = sample(k), np.zeros(9)
+            head = np.array([k, 5 + k // 200, 5_000_000 * (k % 200), 5], "<u4").tobytes() + b"livox"
+            numbers = np.concatenate([[0.0, 0, 0, 1], none, rate, none, force, none])
             writer.write(imu, int(5e9) + 5_000_000 * k, head + numbers.astype("<f8").tobytes())
     return path
 

@@ -166,10 +166,6 @@ def read_calibration(path: Path) -> None:
         assert np.isfinite(mount.shift).all()
 
 
-def control(folder: Path) -> Path:
-    return tum(folder)
-
-
 # Name: what writes a whole input and returns the file to damage, and what reads it, given that file.
 READERS: dict[str, tuple[Callable[[Path], Path], Callable[[Path], None]]] = {
     **{name: ((lambda n: lambda folder: CLOUDS[n](folder / n, POINTS))(name), read_file) for name in CLOUDS},
@@ -177,7 +173,7 @@ READERS: dict[str, tuple[Callable[[Path], Path], Callable[[Path], None]]] = {
     "feet": (feet, read_file),
     "imu": (imu_bag, read_imu),
     "tum": (tum, read_poses),
-    "control": (control, read_control),
+    "control": (tum, read_control),
     "calibration": (calibration, read_calibration),
     **{write.__name__: (write, lambda path: read_recording(path.parent)) for write in (metadata, kitti, times)},
     **{write.__name__: (write, read_rings) for write in (xlsx, csv)},

@@ -10,7 +10,6 @@ from scene.poses.imu import read_inertial
 from scene.progress import Stages
 from scene.reading.recording import Recording
 from tests.scene.bags import custom_msg, write_bag, write_imu_bag, write_tum
-from tests.scene.files import CLOUDS
 from tests.scene.messages import CODES, PLAIN, VELODYNE, pointcloud2, write_bag1
 
 pytestmark = pytest.mark.usefixtures("silent")
@@ -117,8 +116,3 @@ def test_inertial_samples_in_no_known_unit_are_named(tmp_path):
     bag.write_bytes(bag.read_bytes().replace(one + bytes(72), feet + bytes(72)))
     with Recording(bag) as recording, pytest.raises(RecordingError, match=r"force of 32\.2, which is neither"):
         read_inertial(recording, "/livox/imu")
-
-
-@pytest.mark.parametrize("name", CLOUDS)
-def test_a_cloud_of_every_format_whose_points_are_one_ends_in_one_sentence(tmp_path, name):
-    assert outcome(CLOUDS[name](tmp_path / name, np.ones((50, 3), np.float32)))

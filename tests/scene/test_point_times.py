@@ -42,13 +42,6 @@ def test_a_cloud_without_point_times_is_a_static_sweep_and_says_so(tmp_path, ext
     assert not scan.times.any()
 
 
-def test_returns_come_in_the_order_of_time_whatever_the_order_of_rings(tmp_path):
-    order = np.random.default_rng(1).permutation(40)
-    raw = pointcloud2(5.0, OUSTER, 32, columns(XYZ[order], t=(SWEEP[order] * 1e9).astype("u4")), height=4)
-    (scan,), _ = read(write_bag1(tmp_path / "a.bag", {"/ouster/points": [(5.0, raw)]}))
-    np.testing.assert_array_equal(scan.points, XYZ)
-
-
 def test_the_sensor_s_topic_is_preferred_and_the_others_are_named(tmp_path):
     messages = [(5.0 + k, pointcloud2(5.0 + k, PLAIN, 12, columns())) for k in range(3)]
     bag = write_bag1(tmp_path / "a.bag", {"/cloud_registered": messages, "/velodyne_points": messages[:1]})
@@ -57,22 +50,6 @@ def test_the_sensor_s_topic_is_preferred_and_the_others_are_named(tmp_path):
     assert facts["other_lidar_topics"] == ["/cloud_registered"]
     _, facts = read(bag, topic="/cloud_registered", format="bag")
     assert facts["topic"] == "/cloud_registered"
-
-
-@pytest.mark.parametrize("plugin", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
-@pytest.mark.parametrize("whole", [True, False])
-def test_ros2_bags_read_as_folders_and_as_single_files(tmp_path, plugin, whole):
-    messages = [
-        (100.0 + k, pointcloud2(100.0 + k, OUSTER, 32, columns(t=(SWEEP * 1e9).astype("u4")), cdr=True))
-        for k in range(3)
-    ]
-    folder = write_bag2(tmp_path / "b", plugin, "/ouster/points", POINTCLOUD2, messages)
-    path = folder if whole else next(file for file in folder.iterdir() if file.suffix in (".db3", ".mcap"))
-    scans, facts = read(path)
-    assert len(scans) == 3
-    assert facts["message_type"] == POINTCLOUD2
-    np.testing.assert_array_equal(scans[2].points, XYZ)
-    np.testing.assert_allclose(scans[2].times, SWEEP, atol=1e-6)
 
 
 def test_livox_messages_of_ros2_read_with_their_alignment(tmp_path):

@@ -73,17 +73,6 @@ def test_a_few_bad_times_are_left_out_and_counted(tmp_path, kind, unit):
     assert facts["points_without_time"] == missing > 0
 
 
-def test_a_few_times_that_are_no_number_are_left_out_and_counted(tmp_path):
-    rows = sweeps(12)
-    fields = [("x", "f4", 0), ("y", "f4", 4), ("z", "f4", 8), ("time", "f4", 12)]
-    times = np.where(np.arange(len(rows[0][2])) % 50 == 7, np.nan, rows[0][2])
-    raw = [(start, pointcloud2(start, fields, 16, {**dict(zip("xyz", points.T, strict=True)), "time": times}))
-           for start, points, _ in rows]  # fmt: skip
-    scans, facts = read(write_bag1(tmp_path / "a.bag", {"/points": raw}))
-    agree(scans)
-    assert facts["points_without_time"] == 12 * 8
-
-
 @pytest.mark.parametrize("how", [{}, {"point_type": "u4", "point_unit": "ns"}])
 def test_many_bad_times_are_refused_with_their_share(tmp_path, how):
     bag = write_convention(tmp_path / "a.bag", bad_times=0.07, count=40, **how)

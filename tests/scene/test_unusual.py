@@ -1,6 +1,5 @@
 """Well-formed inputs as other people's programs write them: each is read as what it is, or refused in one sentence."""
 
-import lzma
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -20,6 +19,7 @@ from scene.poses.imu import read_inertial
 from scene.poses.trajectory import load_tum
 from scene.reading.cloudfile import read_cloud
 from scene.reading.recording import Recording
+from tests.scene.bags import write_imu_bag
 from tests.scene.conventions import OFFSET, RAYS, sweeps, write_convention
 from tests.scene.files import CLOUDS
 from tests.scene.messages import PLAIN, POINTCLOUD2, pointcloud2, write_bag1
@@ -77,6 +77,7 @@ RECORDINGS = {
         lambda k: 500.0 + 0.1003 * k + SINCE, said="by another clock, s", count=40),
     "time of a simulation, from zero": Sweeps(
         header=lambda k, s: 0.1 * k, said="s after the stamp"),
+    "a few times that are no number": Sweeps(times=lambda k, s: np.where(np.arange(RAYS) % 50 == 7, np.nan, SINCE)),
     "no stamps at all": Sweeps(header=lambda k, s: 0.0, said="the time of recording stands for them"),
     "the first sweeps without times": Sweeps(times=lambda k, s: 0.0 * SINCE if k < 3 else SINCE, said="s after"),
 }  # fmt: skip
@@ -270,39 +271,14 @@ IMUS = {
 @pytest.mark.parametrize("name", IMUS)
 def test_units_of_an_imu_are_told_by_its_size(tmp_path, name, capsys):
     rate, unit, gravity, force, said = IMUS[name]
-    store, path = get_typestore(Stores.ROS1_NOETIC), tmp_path / "a.bag"
-    with Writer(path) as bag:
-        lidar = bag.add_connection("/points", POINTCLOUD2, typestore=store)
-        bag.write(lidar, 5 * 10**9, pointcloud2(5.0, PLAIN, 12, dict(zip("xyz", sweeps(1)[0][1].T, strict=True))))
-        imu = bag.add_connection("/imu", "sensor_msgs/msg/Imu", typestore=store)
-        for k in range(400):
-            push = unit * np.array([0.1 * np.sin(k), 0.1 * np.cos(k), gravity])
-            none = np.zeros(9)
-            numbers = np.concatenate([[0.0, 0, 0, 1], none, [0.0, 0.0, 0.3 * rate], none, push, none])
-            head = np.array([k, 5 + k // 200, 5_000_000 * (k % 200), 3], "<u4").tobytes() + b"imu"
-            bag.write(imu, 5 * 10**9 + 5_000_000 * k, head + numbers.astype("<f8").tobytes())
+    path = write_imu_bag(tmp_path / "a.bag", sweeps(1)[0][1], 400, lambda k: (
+        [0.0, 0.0, 0.3 * rate], unit * np.array([0.1 * np.sin(k), 0.1 * np.cos(k), gravity])))  # fmt: skip
     with Recording(path) as recording:
-        inertial = read_inertial(recording, "/imu")
+        inertial = read_inertial(recording, "/livox/imu")
     assert inertial.rate[:, 2] == pytest.approx(0.3)
     assert np.median(inertial.force[:, 2]) == pytest.approx(force)
-    assert recording.facts.get("imu_units") == (f"/imu: {said}" if said else None)
+    assert recording.facts.get("imu_units") == (f"/livox/imu: {said}" if said else None)
     assert (said or "") in capsys.readouterr().out
-
-
-REFUSED: dict[str, tuple[str, Callable[[Path], object], str]] = {
-    "UTF-16": ("a.xyz", lambda path: path.write_text(ENGLISH, "utf-16"), "it is text in UTF-16; save it as UTF-8"),
-    "xz": ("a.laz.xz", lambda path: path.write_bytes(lzma.compress(b"x" * 99)), "decompress it first: xz -d a.laz.xz"),
-    "degrees": ("a.csv", lambda path: path.write_text("lat lon h\n" + ENGLISH), "in degrees; project them to metres"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", REFUSED)
-def test_what_cannot_be_read_says_what_to_do(tmp_path, name):
-    ending, write, said = REFUSED[name]
-    write(tmp_path / ending)
-    with pytest.raises(RecordingError, match=said) as caught:
-        read_cloud(tmp_path / ending, 1e-3)
-    assert ending in str(caught.value)
 
 
 SPARSE = {"one": XYZ[:1], "NaN": np.full((30, 3), np.nan), "same": np.tile(XYZ[:1], (30, 1))}
