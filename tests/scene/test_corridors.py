@@ -9,8 +9,99 @@ from scene.cleaning.sort import Cleaned
 from scene.errors import Cause
 from scene.fitting.assemble import CentrelineConfig, fit_unfolded
 from scene.judging.judge import JudgingConfig, judge_bore
-from tests.scene.corridors import FURNITURE, HEIGHT, WIDTH, Thing, corridor, furniture, in_corridor
 from tests.scene.fits import thin
+
+Span = tuple[float, float]
+Thing = tuple[Span, Span, Span]  # along the corridor, across it, and above its floor, m
+LENGTH, WIDTH, HEIGHT = 20.0, 4.0, 2.8
+_APART = 0.10  # m between the points
+_NOISE = 0.01  # m
+_EYES = 1.0  # m between the places that it was seen from, in the middle, 1.4 m above the floor
+PLACE = np.array([300.0, -80.0, 12.0])
+_TURN = np.array([[np.cos(0.4), np.sin(0.4), 0.0], [-np.sin(0.4), np.cos(0.4), 0.0], [0.0, 0.0, 1.0]])
+
+# What stands along the right wall: depth, least height, greatest height, length, and gap to the next one, m.
+FURNITURE = {
+    "cabinets": (0.6, 0.0, 2.0, 0.9, 0.5),
+    "benches": (0.5, 0.0, 0.5, 1.8, 0.6),
+    "shelves": (0.4, 0.0, 2.3, 2.5, 0.4),
+    "desks": (0.8, 0.0, 0.75, 1.6, 0.7),
+    "machines": (1.2, 0.0, 1.6, 1.5, 1.0),
+    "racks": (0.9, 0.0, 2.2, 1.0, 0.3),
+    "closets": (0.6, 0.0, 4.0, 1.2, 0.9),
+    "ducts": (0.4, 2.1, 2.4, 6.0, 0.02),
+}
+
+
+def furniture(kind: str) -> list[Thing]:
+    """Things of a kind along the right wall, not all of one size."""
+    depth, low, high, long, gap = FURNITURE[kind]
+    rng = np.random.default_rng(7)
+    things, at = [], 0.8
+    while at + long < LENGTH - 0.5:
+        share = rng.uniform(0.8, 1.2, 3)
+        things.append(
+            (
+                (at, at + long * share[0]),
+                (-WIDTH / 2, -WIDTH / 2 + depth * share[1]),
+                (low, min(low + (high - low) * share[2], HEIGHT - 0.01)),
+            )
+        )
+        at += long * share[0] + gap * rng.uniform(0.7, 1.3)
+    return things
+
+
+def corridor(things: list[Thing], recesses: tuple[Thing, ...] = ()) -> np.ndarray:
+    """Points of walls, floor, ceiling and things as far as somebody who walks down the middle sees them, m.
+
+    Recesses are boxes that the right wall is set back into.
+    """
+    rng = np.random.default_rng(1)
+    room = ((0.0, LENGTH), (-WIDTH / 2, WIDTH / 2), (0.0, HEIGHT))
+    points = np.concatenate([_faces(room, rng, ends=False), *(_faces(thing, rng) for thing in things)])
+    for low, high in (np.array(recess).T for recess in recesses):
+        front = (points[:, 1] < -WIDTH / 2 + 1e-6) & ((points > low) & (points < high))[:, [0, 2]].all(axis=1)
+        points[front, 1] = low[1]
+    points = points[_seen(points, things, LENGTH)]
+    points += rng.normal(0.0, _NOISE, points.shape)
+    return points @ _TURN + PLACE
+
+
+def in_corridor(points: np.ndarray) -> np.ndarray:
+    """Return points of the cloud's frame by station, to the left of the middle and above the floor, m."""
+    return (points - PLACE) @ _TURN.T
+
+
+def _faces(box: Thing, rng: np.random.Generator, ends: bool = True) -> np.ndarray:
+    low, high = np.array(box).T
+    parts = []
+    for axis in range(3) if ends else (1, 2):
+        size = np.delete(high - low, axis)
+        count = int(np.prod(size) / _APART**2)
+        for side in (low, high):
+            part = low + rng.random((count, 3)) * (high - low)
+            part[:, axis] = side[axis]
+            parts.append(part)
+    return np.concatenate(parts)
+
+
+def _seen(points: np.ndarray, things: list[Thing], length: float) -> np.ndarray:
+    """Points that nothing hides from the nearest five places on the way."""
+    seen = np.zeros(len(points), bool)
+    for step in range(-2, 3):
+        eye = np.zeros_like(points)
+        eye[:, 0] = np.clip(np.round(points[:, 0] / _EYES) + step, 0, length / _EYES) * _EYES
+        eye[:, 2] = 1.4
+        free = np.ones(len(points), bool)
+        way = points - eye
+        way = np.where(np.abs(way) < 1e-9, 1e-9, way)
+        for low, high in (np.array(thing).T for thing in things):
+            first, last = (low - eye) / way, (high - eye) / way
+            enter, leave = np.minimum(first, last).max(axis=1), np.maximum(first, last).min(axis=1)
+            free &= ~((enter < leave) & (enter < 1.0 - 1e-6) & (leave > 0.0) & (leave > enter + 1e-9))
+        seen |= free
+    return seen
+
 
 QUICK = ("racks", "shelves", "machines", "closets")
 

@@ -19,7 +19,6 @@ COVERING = {
     "Relocalise": ("Subterra/Relocalise-v1", {}),
     "Faulted and obstructed": ("Subterra/Faulted-v1", {"obstacles": ObstacleParams()}),
 }
-FORWARD = jnp.array([2.0, 0.0])
 
 
 @pytest.fixture(scope="module", params=sorted(COVERING))
@@ -32,11 +31,6 @@ def task(request):
 def forward(env):
     """Straight ahead at full speed, with zeros for whatever else an action holds."""
     return jnp.zeros(env.action_size).at[0].set(2.0)
-
-
-def leaves_equal(a, b, **tolerance):
-    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
-        np.testing.assert_allclose(np.asarray(x), np.asarray(y), **tolerance)
 
 
 def test_an_entry_that_a_task_lacks_is_no_attribute_and_neither_is_a_misspelt_one():
@@ -95,37 +89,6 @@ def test_every_leaf_of_the_params_is_a_strong_array_of_32_bits(task):
         assert isinstance(leaf, jax.Array)
         assert leaf.dtype in (jnp.float32, jnp.int32)
         assert not leaf.weak_type
-
-
-LEAVES = ("horizon", "goal_coverage", "lidar.range_sigma", "vehicle.speed_max", "start.lateral")
-
-
-@pytest.mark.parametrize("leaves", [LEAVES, *(pytest.param((leaf,), marks=pytest.mark.slow) for leaf in LEAVES)])
-def test_params_may_be_batched(leaves):
-    env, params = st.make("Subterra/TraverseShort-v1")
-
-    def read(leaf):
-        part, _, name = leaf.rpartition(".")
-        return getattr(getattr(params, part) if part else params, name)
-
-    def put(tree, values):
-        for leaf, value in zip(leaves, values, strict=True):
-            part, _, name = leaf.rpartition(".")
-            inner = (getattr(tree, part) if part else tree).replace(**{name: value})
-            tree = tree.replace(**{part: inner}) if part else inner
-        return tree
-
-    def two_steps(params):
-        _, state = env.reset(jax.random.key(0), params)
-        _, state, *_ = env.step(jax.random.key(1), state, FORWARD, params)
-        return env.step(jax.random.key(2), state, FORWARD, params)
-
-    values, axes = [jnp.stack([read(leaf), 2 * read(leaf)]) for leaf in leaves], jax.tree.map(lambda _: None, params)
-    batched = jax.jit(jax.vmap(two_steps, (put(axes, [0] * len(leaves)),)))(put(params, values))
-    alone = jax.jit(two_steps)
-    for i in range(2):
-        one = alone(put(params, [value[i] for value in values]))
-        leaves_equal(one, jax.tree.map(lambda x, i=i: x[i], batched), atol=2e-4)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e30])

@@ -145,11 +145,6 @@ def test_a_random_surface_has_its_standard_deviation_and_correlation_length_both
         pairs = [(row[8:], row[:-8]) if axis == 0 else (row[:, 8:], row[:, :-8]) for row in rows]
         lag = np.mean([np.mean(a * b) for a, b in pairs]) / 0.04**2
         assert lag == pytest.approx(np.exp(-1.0), abs=0.06)
-    # The sum of cosines as it stands, without the factors.
-    waves, at = Waves.draw(np.random.default_rng(1), 0.04, 0.8), 3173
-    phase = waves.frequency @ np.array([station[at], girth[11]]) + waves.phase
-    own = waves.relief(grid, np.array([11]))[at, 0]
-    assert own == pytest.approx(waves.amplitude * np.cos(phase).sum(), abs=1e-5)
 
 
 def test_a_random_surface_is_the_sum_of_its_cosines_to_a_nanometre_and_does_not_depend_on_the_order_of_sums():

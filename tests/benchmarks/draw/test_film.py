@@ -1,4 +1,4 @@
-"""A film shows the episode that was driven, from its start to its end."""
+"""A film shows the episode that was driven, from its start to its end; a camera stands anywhere in a scene."""
 
 import io
 
@@ -7,6 +7,7 @@ import pytest
 from PIL import Image
 
 from benchmarks.draw import film
+from benchmarks.draw.scene import Pose
 
 
 @pytest.fixture(scope="module")
@@ -47,3 +48,8 @@ def test_beams_end_at_the_walls_that_are_drawn(episode):
     share = np.einsum("psj,sj->ps", ends[:, None] - start, along) / np.maximum(np.sum(along**2, axis=1), 1e-12)
     gap = np.linalg.norm(ends[:, None] - start - np.clip(share, 0.0, 1.0)[..., None] * along, axis=-1).min(axis=1)
     assert gap.max() < 0.25
+
+
+def test_the_axes_of_a_camera_are_right_up_and_ahead():
+    pose = Pose(np.array([1.0, 2.0, 3.0]), np.array([1.0, 0.0, 0.0]), np.pi / 2, 120, 90)
+    np.testing.assert_allclose(pose.axes, [[0, -1, 0], [0, 0, 1], [1, 0, 0]], atol=1e-12)

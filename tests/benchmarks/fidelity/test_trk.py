@@ -1,4 +1,4 @@
-"""TRK: sleepers, rails, pads and fasteners."""
+"""TRK and SCN: the track, and the scene in MuJoCo."""
 
 from dataclasses import replace
 from functools import cache, partial
@@ -6,8 +6,12 @@ from functools import cache, partial
 import numpy as np
 import pytest
 
+from benchmarks.fidelity import table
+from benchmarks.fidelity.candidate import load_candidate
+from benchmarks.fidelity.case import Case
+from benchmarks.fidelity.derive.scene import rays_from_axis
 from benchmarks.fidelity.derive.track import hold_railway
-from tests.benchmarks.fidelity import tube
+from tests.benchmarks.fidelity import tube, tubescene
 from tests.benchmarks.fidelity.judged import SHORT, against, measure
 
 judged = partial(against, SHORT)
@@ -75,3 +79,101 @@ def test_where_the_recording_shows_no_track_there_is_nothing_to_match():
 
 def test_sleepers_that_the_truth_has_not_match_nothing():
     assert measure("trk_sleeper_f1", tube.case(replace(SHORT, track=False), SHORT)).value == 0.0
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory):
+    return Case(load_candidate(tubescene.write(tmp_path_factory.mktemp("scene") / "tube", SHORT)))
+
+
+@pytest.fixture
+def rewritten(good, tmp_path):
+    """The good scene with one piece of its text replaced."""
+
+    def rewrite(old, new, count=-1):
+        text = good.candidate.scene.read_text()
+        assert old in text
+        path = good.candidate.folder / f"{tmp_path.name}.xml"  # beside the meshes that it names
+        path.write_text(text.replace(old, new, count))
+        return Case(replace(good.candidate, scene=path))
+
+    return rewrite
+
+
+@pytest.mark.parametrize("id", [row.id for row in table.load().values() if row.category == "SCN" and row.scored])
+def test_a_sound_scene_scores_full_marks(good, id):
+    value = measure(id, good)
+    assert table.load()[id].map.score(value.value) == 100.0, value
+
+
+def test_rays_see_nothing_of_a_robot_with_wheels(good, rewritten):
+    wheel = '<body name="wheel" pos="0 0.5 0"><joint/><geom type="sphere" size="0.4" mass="1" contype="0"/></body>'
+    wheeled = rewritten('conaffinity="3"/></body>', f'conaffinity="3"/>{wheel}</body>')
+    for id in ("mj_ray_vs_mesh_mae", "mj_probe_free_frac", "mj_wall_contact_err"):
+        assert measure(id, wheeled).value == measure(id, good).value
+    seen = [rays_from_axis(case)[0] for case in (wheeled, good)]
+    np.testing.assert_array_equal(*seen)
+
+
+def test_the_step_rate_is_measured(good):
+    assert measure("mj_step_rate", good).value > 100.0
+
+
+def test_a_scene_that_does_not_compile_fails(rewritten):
+    assert measure("mj_compiles", rewritten('type="sphere"', 'type="no-such"')).value == 0.0
+
+
+def test_a_bore_that_collides_as_one_mesh_is_full_of_its_convex_hull(rewritten):
+    case = rewritten('mesh="lining" contype="0"', 'mesh="lining" contype="1"')
+    assert measure("mj_probe_free_frac", case).value == 0.0
+    assert measure("mj_wall_contact_err", case).value > 1.0
+    assert measure("mj_ray_vs_mesh_mae", case).value < 1e-3  # rays alone would not notice
+
+
+@pytest.mark.parametrize(("aside", "free"), [(0.27, False), (0.34, True)])
+def test_a_thing_within_thirty_centimetres_of_the_axis_is_touched(rewritten, aside, free):
+    place = " ".join(f"{value:.4f}" for value in SHORT.point(6.0, aside, 0.0)[0])
+    case = rewritten("</worldbody>", f'<geom type="sphere" size="0.01" pos="{place}"/></worldbody>')
+    assert (measure("mj_probe_free_frac", case).value == 1.0) == free
+
+
+def test_panels_off_by_a_hand_are_touched_too_late(tmp_path):
+    off = Case(load_candidate(tubescene.write(tmp_path / "tube", SHORT, panels_off=0.10)))
+    assert measure("mj_wall_contact_err", off).value == pytest.approx(0.10, abs=0.01)
+
+
+def test_a_shifted_lining_is_off_by_its_shift(rewritten):
+    case = rewritten('name="lining_000" type="mesh"', 'name="lining_000" pos="0 0 0.05" type="mesh"')
+    assert measure("mj_frame_err", case).value == pytest.approx(0.05, abs=1e-3)
+    assert 0.01 < measure("mj_ray_vs_mesh_mae", case).value < 0.5
+
+
+def test_a_lining_left_out_lets_rays_through(rewritten):
+    case = rewritten('name="lining_000" type="mesh"', 'name="lining_000" group="4" type="mesh"')
+    assert measure("mj_ray_leak_rate", case).value > 0.5
+
+
+def test_a_sleeper_less_than_the_manifest_says_is_told(rewritten):
+    case = rewritten('name="sleeper_0003"', 'name="plank"')
+    value = measure("mj_manifest_match", case)
+    assert value.value == 0.0
+    assert "sleepers: 19 of 20" in value.reason
+
+
+def test_a_robot_heavier_than_it_states_is_invalid(rewritten):
+    heavier = '</freejoint><inertial pos="0 0 0" mass="25" diaginertia="1 1 1"/>'
+    case = rewritten("<freejoint/>", heavier.replace("</freejoint>", "<freejoint/>"))
+    assert measure("mj_inertia_valid", case).value == 0.0
+
+
+def test_a_scene_without_a_robot_fails_the_step(rewritten):
+    value = measure("mj_step_finite", rewritten("<freejoint/>", ""))
+    assert value.failed
+    assert value.reason.startswith("ValueError: ")
+    assert "moves freely" in value.reason
+
+
+def test_what_does_not_change_is_not_computed_again(good, monkeypatch):
+    before = measure("mj_wall_contact_err", good).value
+    monkeypatch.setattr("benchmarks.fidelity.derive.contact.Probe", None)
+    assert measure("mj_wall_contact_err", good).value == before

@@ -1,13 +1,15 @@
-"""The robot's MJCF against its figures."""
+"""The robot's MJCF against its figures; its looks change nothing of its motion."""
 
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+import trimesh
 
 from subterra_jax.b2 import constants as b2
 from subterra_jax.b2.kinematics import standing_pose
-from subterra_jax.b2.model import B2, robot_spec
+from subterra_jax.b2.model import B2, dress, robot_spec
+from subterra_jax.b2.shape import shape_of
 from subterra_jax.host.rover import GROUND
 from subterra_jax.physics.engine import Build, Engine
 from subterra_jax.physics.ground import N_PLANES
@@ -84,17 +86,6 @@ def test_it_stands_for_ten_seconds_within_five_centimetres(on_floor):
     assert not np.isnan(data.qpos).any()
 
 
-def test_with_the_gains_of_the_isaac_configurations_it_collapses(on_floor):
-    """Why the gains are ours: the figure that this rests on can be seen."""
-    model = on_floor.__copy__()
-    model.actuator_gainprm[:, 0], model.actuator_biasprm[:, 1], model.actuator_biasprm[:, 2] = 160.0, -160.0, -5.0
-    data = standing(model)
-    data.ctrl[:] = standing_pose()[0]
-    for _ in range(1000):
-        mujoco.mj_step(model, data)
-    assert data.qpos[2] < 0.4
-
-
 def test_only_feet_touch_the_ground_and_only_the_bumpers_walls(model):
     touching = {model.geom(k).name: model.geom_conaffinity[k] for k in range(model.ngeom)}
     assert touching == {"trunk": 0, **dict.fromkeys(b2.BUMPERS, 8), **{f"{leg}_foot": 4 for leg in b2.LEGS}}
@@ -111,3 +102,72 @@ def test_the_friction_that_is_drawn_is_that_of_the_feet_and_of_nothing_else():
     assert (~feet).sum() == 2
     np.testing.assert_allclose(friction[feet], 0.33, rtol=1e-6)
     np.testing.assert_array_equal(friction[~feet], host.pair_friction[~feet, 0].astype(np.float32))
+
+
+BODIES = ("base_link", *(f"{leg}_{part}" for leg in b2.LEGS for part in b2.PARTS))
+
+
+@pytest.mark.parametrize("body", BODIES)
+def test_each_part_is_closed_and_seen_from_outside(body):
+    for part in shape_of(body):
+        mesh = trimesh.Trimesh(part.vertices, part.faces, process=True)
+        assert mesh.is_watertight
+        assert mesh.volume > 0.0
+
+
+def test_an_unknown_body_has_no_looks():
+    with pytest.raises(KeyError):
+        shape_of("XX_thigh")
+
+
+@pytest.fixture(scope="module")
+def models():
+    plain, dressed = robot_spec(), robot_spec()
+    dress(dressed)
+    for spec in (plain, dressed):
+        ground = {"type": mujoco.mjtGeom.mjGEOM_PLANE, "size": (5.0, 5.0, 1.0)}
+        spec.worldbody.add_geom(name="ground", contype=GROUND, conaffinity=0, **ground)
+    return plain.compile(), dressed.compile()
+
+
+def test_the_robot_moves_by_the_same_bits_with_its_looks_as_without(models):
+    ends = []
+    for model in models:
+        data = standing(model)
+        hold = data.ctrl.copy()
+        for step in range(300):
+            data.ctrl[:] = hold + 0.3 * np.sin(0.05 * step + np.arange(12))
+            mujoco.mj_step(model, data)
+        ends.append((data.qpos.tobytes(), data.qvel.tobytes(), data.qacc.tobytes()))
+    assert ends[0] == ends[1]
+    for name in ("body_mass", "body_inertia", "body_ipos", "body_iquat"):
+        assert getattr(models[0], name).tobytes() == getattr(models[1], name).tobytes(), name
+
+
+def test_physics_has_no_looks_and_looks_touch_nothing(models):
+    plain, dressed = models
+    assert not (plain.geom_type == mujoco.mjtGeom.mjGEOM_MESH).any()
+    looks = dressed.geom_type == mujoco.mjtGeom.mjGEOM_MESH
+    assert looks.sum() == sum(len(shape_of(body)) for body in BODIES)
+    assert not dressed.geom_contype[looks].any()
+    assert not dressed.geom_conaffinity[looks].any()
+    own = dressed.geom_bodyid > 0
+    assert (dressed.geom_group[looks] == 2).all()
+    assert (dressed.geom_group[own & ~looks] == 3).all()
+
+
+def test_it_stands_within_the_makers_envelope(models):
+    model = models[1]
+    data = standing(model)
+    mujoco.mj_kinematics(model, data)
+    points = []
+    for body in BODIES:
+        turn, middle = data.body(body).xmat.reshape(3, 3), data.body(body).xpos
+        points += [part.vertices @ turn.T + middle for part in shape_of(body)]
+    points = np.concatenate(points)
+    length, width, height = np.ptp(points, axis=0)
+    assert points[:, 2].min() == pytest.approx(0.0, abs=0.003)
+    # The LiDAR's housing stands higher than the data sheet's robot without one.
+    assert length < b2.ENVELOPE[0]
+    assert width == pytest.approx(b2.ENVELOPE[1], abs=0.06)
+    assert height == pytest.approx(b2.STAND_HEIGHT + b2.LIDAR[2] + 0.06, abs=0.01)
