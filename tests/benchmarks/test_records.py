@@ -14,6 +14,7 @@ from benchmarks import records, report
 from benchmarks.command import BenchmarkError, run_module
 from benchmarks.records import Record, rendered
 from benchmarks.truth import compare, load_truth
+from tests.test_docs import command_line  # noqa: F401 (a fixture)
 
 ONE = Record(
     "speed/step", 215.0, "M steps/s", (210.5, 219.0), 8, "control", 0, "one H200", {"jax": "0.11.2"}, "2026-11-26",
@@ -80,7 +81,7 @@ def test_a_number_is_shown_with_the_digits_that_it_has(value, text):
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of runpy: the tests have imported the module before
-def test_every_record_has_a_command_that_its_module_understands(command_line):
+def test_every_record_has_a_command_that_its_module_understands(command_line):  # noqa: F811
     words = {one.command for one in records.on_record().values() if not one.commit.startswith("until ")}
     for command in sorted(words):
         if command.split()[0] not in ("timeit", "pytest"):
