@@ -35,7 +35,7 @@ def main(words: Sequence[str] | None = None) -> int:
         The exit status; 2 for a name that does not exist and for a command whose files are not installed.
     """
     words = list(sys.argv[1:] if words is None else words)
-    name = parse(_read, words[:1]).command
+    name = parse(_read, words if words[:1] == ["tasks"] else words[:1]).command
     module, _ = COMMANDS[name]
     if not module:
         from subterra_jax.tasks import list_tasks

@@ -155,7 +155,10 @@ MISTAKES = {
     "benchmarks.draw scene tunnel --out text.txt/x.png": "text.txt: is a file",
     "subterra_jax.viewer --seed x": "invalid int value: 'x'",
     "subterra_jax.viewer --sensor radar": "no sensor 'radar'; there are planar16",
-    "subterra_jax.viewer --moon": "unrecognized arguments: --moon",
+    "subterra_jax.viewer --tunel metro": "nothing is named --tunel; --tunnel is",
+    "benchmarks.fidelity rnu": "nothing is named rnu; run is",
+    "scene.build --trajectry=a.tum": "nothing is named --trajectry; --trajectory is",  # before what is missing
+    "subterra_jax tasks --tunel x": "unrecognized arguments: --tunel x",
     "subterra_jax.viewer --scene nowhere": "nowhere: no such scene folder",
     "subterra_jax.viewer --tunnel metro --scene s": "either --scene or --tunnel",
     "subterra_jax.viewer --task B2Walk": "Subterra/B2Walk-v1 has no episode to show",

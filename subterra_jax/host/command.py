@@ -4,6 +4,7 @@ tyro shows every option of every group, each with its whole text. Here `--help` 
 itself and names the other groups, which `--help-all` shows as well.
 """
 
+import difflib
 import importlib.util
 import io
 import os
@@ -13,7 +14,8 @@ import sys
 import textwrap
 import warnings
 from collections.abc import Callable
-from contextlib import redirect_stderr, redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout, suppress
+from itertools import takewhile
 from typing import TypeVar
 
 from subterra_jax.host.errors import SubterraError
@@ -48,7 +50,7 @@ def parse(read: Callable[[list[str]], T], words: list[str] | None = None, groups
             return read(["--help" if word == "--help-all" else word for word in words])
     except SystemExit as ended:
         if ended.code:
-            print(f"error: {complaint_sentence(complaint.getvalue())}", file=sys.stderr)
+            print(f"error: {_misspelt(read, words) or complaint_sentence(complaint.getvalue())}", file=sys.stderr)
         else:
             text = page.getvalue().rstrip() if "--help-all" in words else _short_help(page.getvalue(), groups)
             sys.exit(run_command(lambda: print(text)))
@@ -159,6 +161,23 @@ def _short_help(page: str, groups: tuple[str, ...]) -> str:
 def _wrap(line: str) -> list[str]:
     """Breaks a line at the terminal's width; tyro leaves the lines of docstrings as they are."""
     return textwrap.wrap(line, shutil.get_terminal_size().columns)
+
+
+def _misspelt(read: Callable[[list[str]], object], words: list[str]) -> str:
+    """Returns a sentence about the first word that names no option or command, with the nearest name that does."""
+    lead = list(takewhile(lambda word: not word.startswith("-"), words))
+    page = io.StringIO()
+    with suppress(SystemExit), redirect_stdout(page), redirect_stderr(io.StringIO()):
+        read([*lead, "--help"])
+    options = re.findall(r"(?<!\S)(--[a-z][\w.-]*)", page.getvalue())
+    usage = page.getvalue().partition("\n\n")[0]
+    commands = [name for names in re.findall(r"\{([\w,-]+)\}", usage) for name in names.split(",")]
+    for word in words:
+        name = word.partition("=")[0].replace("_", "-")
+        known = options if word.startswith("--") else commands if [word] == lead[:1] else []
+        if name not in known and (near := difflib.get_close_matches(name, known, n=1, cutoff=0.65)):
+            return f"nothing is named {name}; {near[0]} is; --help shows what there is"
+    return ""
 
 
 def complaint_sentence(complaint: str) -> str:
