@@ -7,7 +7,8 @@ figures of such files differ from those on record.
 
 A record is one figure. Commands write theirs to `records.json` beside their other results. A page
 holds a table's template in a comment, with ids in braces, and the rendered table behind it. A line
-`{board: SPLIT}` is the board's tables by kind, `{board: screen}` its table of all tasks.
+`{board: SPLIT}` is the board's tables by kind, `{board: screen}` its table of all tasks; `{rows: FAMILY; COLUMN COLUMN;
+LABEL = ROW; ROW}` a line for each row, of the records `FAMILY/ROW/COLUMN`, with a dash where one was not measured.
 """
 
 import dataclasses
@@ -29,6 +30,7 @@ _VERSIONS = ("python", "jax", "numpy", "subterra-jax")
 _BLOCK = re.compile(r"<!-- records\n(.*?)-->\n(.*?)<!-- /records -->", re.DOTALL)
 _FIGURE = re.compile(r"\{([\w.+-]+(?:/[\w.+-]+)+)(?:\|(\w+))?\}")
 _BOARD = re.compile(r"\{board: ([\w-]+)\}\n")
+_ROWS = re.compile(r"\{rows: ([\w-]+)(\|\w+)?;([^;}]+);([^}]+)\}")
 _ID = re.compile(r"[\w.+-]+(/[\w.+-]+)+")
 
 
@@ -192,9 +194,20 @@ def rendered(text: str, records: dict[str, Record], page: str) -> str:
         value = getattr(records[id], field)
         return number(value) if isinstance(value, float) else str(value)
 
+    def rows(found: re.Match[str]) -> str:
+        family, field, columns, names = found.groups(default="")
+        lines = []
+        for label, _, name in (row.strip().partition(" = ") for row in names.split(";")):
+            ids = [f"{family}/{name or label}/{column}" for column in columns.split()]
+            if not records.keys() & ids:
+                raise BenchmarkError(f"{page}: there is no record {family}/{name or label}/… in {FOLDER.name}/")
+            cells = [f"{{{id}{field}}}" if id in records else "-" for id in ids]
+            lines.append(f"| {' | '.join([label, *cells])} |")
+        return "\n".join(lines)
+
     def block(found: re.Match[str]) -> str:
         template = found[1]
-        text = _BOARD.sub(lambda split: board(split[1]), template)
+        text = _ROWS.sub(rows, _BOARD.sub(lambda split: board(split[1]), template))
         return f"<!-- records\n{template}-->\n{_FIGURE.sub(figure, text)}<!-- /records -->"
 
     return _BLOCK.sub(block, text)

@@ -21,6 +21,7 @@ ONE = Record(
     "benchmarks.throughput --out out/speed", "abc", "at least", 15.0,
 )  # fmt: skip
 PAGE = "before\n<!-- records\n| a | {speed/step} | {speed/step|hardware} |\n-->\nstale\n<!-- /records -->\nafter\n"
+GRID = "<!-- records\n{rows: arena|value; dust rock;\nKISS = kiss; dlio}\n-->\n<!-- /records -->"
 
 
 def test_a_table_is_rendered_from_records_and_only_between_its_marks():
@@ -28,12 +29,16 @@ def test_a_table_is_rendered_from_records_and_only_between_its_marks():
     assert "-->\n| a | 215 M steps/s (210.5-219) | one H200 |\n<!-- /records -->\nafter" in text
     assert text.startswith("before\n<!-- records\n| a | {speed/step} |")
     assert rendered(text, {ONE.id: ONE}, "page.md") == text
+    ids = ("arena/kiss/rock", "arena/kiss/dust", "arena/dlio/dust")
+    known = {id: dataclasses.replace(ONE, id=id, value=float(k)) for k, id in enumerate(ids)}
+    assert "-->\n| KISS | 1 | 0 |\n| dlio | 2 | - |\n<!--" in rendered(GRID, known, "page.md")
 
 
 @pytest.mark.parametrize(
     ("page", "message"),
     [
         (PAGE.replace("speed/step}", "speed/other}"), r"page.md: there is no record 'speed/other'"),
+        (GRID, r"page.md: there is no record arena/kiss/…"),
         (PAGE.replace("|hardware", "|colour"), r"page.md: a record has no 'colour' \(speed/step\)"),
     ],
 )
