@@ -56,7 +56,7 @@ def _ranges(driven, share=0.01):
 
 def _looked_at(ranges, driven, walls):
     """Returns the points of a drive as they are recorded in training."""
-    params = SimpleNamespace(lidar=SimpleNamespace(range_max=30.0))
+    params = SimpleNamespace(lidar=SimpleNamespace(range_max=30.0, intensity=False))
     moved = jnp.asarray(np.diff(driven, prepend=driven[:1]))
 
     def step(bend, row):
@@ -93,7 +93,7 @@ def test_a_robot_makes_the_metres_of_its_training(front, with_map):
         tunnel=SimpleNamespace(first_node=jnp.zeros((), jnp.int32)),
         start=SimpleNamespace(station=3.0, station_sigma=0.0),
         vehicle=SimpleNamespace(period=0.1),
-        lidar=SimpleNamespace(range_max=30.0),
+        lidar=SimpleNamespace(range_max=30.0, intensity=False),
     )
     locator, one, no = Locator(weights, strip), jnp.ones(()), jnp.zeros((), bool)
 
@@ -183,7 +183,7 @@ def test_a_way_back_begins_at_the_place_that_the_flag_tells():
         goal_kind="return",
         start=SimpleNamespace(station=50.0, station_sigma=0.0),
         vehicle=SimpleNamespace(period=0.1),
-        lidar=SimpleNamespace(range_max=30.0),
+        lidar=SimpleNamespace(range_max=30.0, intensity=False),
         goal=SimpleNamespace(flag_reach=2.0),
     )
     ways = TwoWays(Locator(memory.init("match", jax.random.key(0))))
