@@ -100,7 +100,7 @@ def test_a_row_of_sleepers_is_no_chance_with_any_true_pitch_and_some_unseen(pitc
 
 
 FILLED = 8  # every so many places: a pocket mortared flush, where the mortar gives half of the echoes
-BEYOND, THIN = 0.30, 0.6  # m from a pocket away from its joint; share of the echoes that is missing there
+BEYOND, THIN = 0.30, 0.75  # m from a pocket away from its joint; share of the echoes that is missing there
 MOUTH = JOINTS[0] - OFFSET - HALF[0] - 0.05  # m: the first pockets begin 5 cm behind it
 
 
