@@ -90,7 +90,7 @@ def _add_trunk_geom(trunk: mujoco.MjsBody) -> None:
     for name, end in zip(b2.BUMPERS, (1.0, -1.0), strict=True):
         trunk.add_geom(
             name=name, type=_SPHERE, pos=(end * b2.BUMPER_X, 0.0, 0.0), size=(b2.BUMPER_RADIUS, 0.0, 0.0), mass=0.0,
-            contype=0, conaffinity=LOW_WALL, condim=1, group=_HIDDEN,
+            contype=0, conaffinity=LOW_WALL, condim=1, priority=1, group=_HIDDEN,
         )  # fmt: skip
 
 

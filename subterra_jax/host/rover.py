@@ -61,7 +61,7 @@ def rover_mjcf(lidar_height: float = LIDAR_HEIGHT) -> ET.Element:
     )  # fmt: skip
     for wheel, bumper, (x, y) in zip(WHEELS, BUMPERS, ((1, 1), (1, -1), (-1, 1), (-1, -1)), strict=True):
         at = _text(x * (HALF_SIZE[0] - _BUMPER), y * (HALF_SIZE[1] - _BUMPER), 0)
-        rest = {**solid, "group": "3", "condim": "1", "conaffinity": str(LOW_WALL), "solref": "0.01 1"}
+        rest = {**solid, "group": "3", "condim": "1", "priority": "1", "conaffinity": str(LOW_WALL), "solref": "0.01 1"}
         _add(body, "geom", name=bumper, type="sphere", size=f"{_BUMPER:g}", pos=at, **rest)
         _add_wheel(body, wheel, (x * WHEELBASE / 2, y * TRACK / 2, AXLE_UP))
     up = lidar_height - HEIGHT
