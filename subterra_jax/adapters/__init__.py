@@ -10,7 +10,7 @@ from subterra_jax.host.task_ids import MISSIONS, PLANAR, WALK
 _SINGLE = "subterra_jax.adapters.single:SubterraEnv"
 _VECTOR = "subterra_jax.adapters.vector:SubterraVectorEnv"
 # MuJoCo is loaded only where one of these is made.
-_ON_LEGS = dict.fromkeys(MISSIONS, "subterra_jax.b2.gym:B2Env") | {WALK: "subterra_jax.b2.gym:B2WalkEnv"}
+_ON_LEGS = "subterra_jax.b2.gym:B2Env"
 
 
 def register_tasks(tasks: Sequence[str] = PLANAR) -> None:
@@ -20,6 +20,6 @@ def register_tasks(tasks: Sequence[str] = PLANAR) -> None:
     for task in tasks:
         if task not in registration.registry:
             registration.register(id=task, entry_point=_SINGLE, vector_entry_point=_VECTOR, kwargs={"task": task})
-    for task, entry in _ON_LEGS.items():
+    for task in (WALK, *MISSIONS):
         if task not in registration.registry:
-            registration.register(id=task, entry_point=entry, kwargs={"task": task})
+            registration.register(id=task, entry_point=_ON_LEGS, kwargs={"task": task})

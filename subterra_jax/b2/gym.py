@@ -25,10 +25,10 @@ def compile_for_cpu(function: Callable[..., Any], params: Any, *examples: Any) -
 
 
 class B2Env(SubterraEnv):
-    """One B2 that walks a tunnel on a frozen gait; action and observation are those of the planar task.
+    """One B2 that walks a tunnel on a frozen gait, by the action and observation of the planar task; or learns to walk.
 
-    A step is 0.2 s: ten control periods of the gait, fifty steps of physics. `info` has `station`, `fall` and
-    `contact` among others.
+    A step is 0.2 s: ten control periods of the gait, fifty steps of physics; or one of `b2.walk.WalkEnv`, 0.02 s.
+    `info` has `station`, `fall` and `contact` among others.
 
     Args:
         task: Id of the task.
@@ -38,7 +38,7 @@ class B2Env(SubterraEnv):
         render_mode: `None` or `rgb_array`.
         width: Width of a picture, pixels.
         height: Height of a picture, pixels.
-        **options: As for `tasks.make_mission`: `policy`, `sensor` and so on.
+        **options: As for `tasks.make_mission`: `policy`, `sensor` and so on; or as for `tasks.make`.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 5}  # noqa: RUF012  as Gymnasium declares it
@@ -56,31 +56,12 @@ class B2Env(SubterraEnv):
         **options: Any,
     ):
         check_mode(render_mode)
+        make: Any = tasks.make if task == WALK else tasks.make_mission
         with jax.default_device(first_cpu()):
-            env, params = self._make(task, tunnel, lining, scene, options)
+            env, params = make(task, tunnel, lining, scene=scene, engine="mujoco", **options)
+        self.metadata = {**self.metadata, "render_fps": 50 if task == WALK else 5}
         self.walk = env if task == WALK else env.motion.walk
         file = None if scene is None else scene_file(scene, lining)
         choice = TunnelChoice(tunnel, lining)
         self.camera = RobotView(self.walk.physics, params.track, choice, file, width, height)
         self._adopt(Task(env, params, flat=task == WALK, compile=compile_for_cpu), self.camera, render_mode)
-
-    def _make(self, task: str, tunnel: Any, lining: str | None, scene: Any, options: dict[str, Any]) -> tuple[Any, Any]:
-        return tasks.make_mission(task, tunnel, lining, scene=scene, engine="mujoco", **options)
-
-
-class B2WalkEnv(B2Env):
-    """One B2 that learns to walk: twelve joint offsets fifty times a second, as in `subterra_jax.b2.walk.WalkEnv`.
-
-    Args:
-        task: Id of the task.
-        *args: As for `B2Env`.
-        **options: As for `B2Env`; what is left is for `tasks.make`.
-    """
-
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012  as Gymnasium declares it
-
-    def __init__(self, task: str = WALK, *args: Any, **options: Any):
-        super().__init__(task, *args, **options)
-
-    def _make(self, task: str, tunnel: Any, lining: str | None, scene: Any, options: dict[str, Any]) -> tuple[Any, Any]:
-        return tasks.make(task, tunnel, lining, scene=scene, engine="mujoco", **options)

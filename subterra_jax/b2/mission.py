@@ -7,7 +7,6 @@ import dataclasses
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
-from flax import struct
 from jax import lax
 from jaxtyping import Array, PRNGKeyArray
 
@@ -19,22 +18,11 @@ from subterra_jax.b2.walk import WalkEnv
 from subterra_jax.parts import Drive, Moved
 from subterra_jax.parts.part import Batch, Keys
 from subterra_jax.physics.engine import Body
-from subterra_jax.physics.riding import Physical, Ride, place_on
+from subterra_jax.physics.riding import Physical, place_on
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel import Tunnel
 
 PERIODS = 10  # control periods of the gait in one of the task
-
-
-@struct.dataclass
-class LegsState:
-    """A robot on its legs.
-
-    Attributes:
-        walk: State of the walking robot.
-    """
-
-    walk: WalkState
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,9 +42,6 @@ class Legs(Physical):
         """Return `vehicle`, limits of a command; `track`; `walk`, the robot; and `policy`, its gait (None: trot)."""
         return {**super().defaults(), "walk": None, "policy": None}
 
-    def ride(self, own: LegsState) -> Ride:
-        return Ride(own.walk.body, own.walk.anchor)
-
     def draw_reset(self, key: Keys, batch: Batch, params: EnvParams) -> WalkResetNoise:
         """Draw how the robot is built, and its first readings."""
         return self.walk.draw_reset(key, batch, params.walk)
@@ -64,13 +49,13 @@ class Legs(Physical):
     def draw_step(self, key: PRNGKeyArray, batch: Batch, params: EnvParams) -> WalkStepNoise:
         return self.walk.draw_step(key, (*batch, PERIODS), params.walk)
 
-    def begin(self, draw: WalkResetNoise, state: State, params: EnvParams) -> LegsState:
-        return LegsState(stand(state, draw, params.walk))
+    def begin(self, draw: WalkResetNoise, state: State, params: EnvParams) -> WalkState:
+        return stand(state, draw, params.walk)
 
     def move(self, state: State, drive: Drive, noise: WalkStepNoise, tunnel: Tunnel, params: EnvParams) -> Moved:
         """Walk for one control period of the task; see `Motion.move`."""
         command = jnp.stack([drive.wheels[0], jnp.zeros(()), drive.wheels[1]])
-        walk = dataclasses.replace(state.legs.walk, command=command)
+        walk = dataclasses.replace(state.legs, command=command)
 
         def control(walk: WalkState, drawn: WalkStepNoise) -> tuple[WalkState, tuple[Array, ...]]:
             action = jnp.zeros(12)
@@ -84,7 +69,7 @@ class Legs(Physical):
 
         walk, (counted, gap, contact, fall) = lax.scan(control, walk, noise)
         wheels, clear = jnp.mean(counted, axis=0), jnp.min(gap)
-        return self.moved(state, LegsState(walk), wheels, clear, jnp.any(contact), jnp.any(fall), tunnel, params)
+        return self.moved(state, walk, wheels, clear, jnp.any(contact), jnp.any(fall), tunnel, params)
 
 
 def stand(plane: State, noise: WalkResetNoise, walk: WalkParams) -> WalkState:

@@ -6,8 +6,9 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from subterra_jax.b2.gait import GaitParams, GaitState
-from subterra_jax.physics.engine import Body, Build
+from subterra_jax.physics.engine import Build
 from subterra_jax.physics.ground import Track
+from subterra_jax.physics.riding import Ride
 from subterra_jax.tunnel import Tunnel
 
 Range = Array | tuple[float, float]
@@ -146,11 +147,9 @@ class Proprioception:
 
 
 @struct.dataclass
-class WalkState:
-    """State of one robot. Positions are from the anchor, which keeps them small."""
+class WalkState(Ride):
+    """State of one robot."""
 
-    body: Body  # state of the physics
-    anchor: Int[Array, ""]  # row of the track nearest to the robot
     gait: GaitState  # state of the gait
     command: Float[Array, "3"]  # commanded velocity forward and to the left (m/s), and yaw rate (rad/s)
     drawn_command: Float[Array, "3"]  # command as drawn, before it is changed to keep the robot between the rails

@@ -1,6 +1,7 @@
 """One engine for robots that roll or walk: a control period in MJX on the window of ground, or in MuJoCo's own C."""
 
 import contextlib
+import copy
 import dataclasses
 import io
 import threading
@@ -265,24 +266,21 @@ class Workbench:
     """
 
     def __init__(self, model: mujoco.MjModel, machine: Machine):
-        self.model, self.data = model, mujoco.MjData(model)
+        self.model, self.data, self._usual = model, mujoco.MjData(model), copy.copy(model)
         self._lock = threading.Lock()  # held while a robot is advanced
         self._treads = Engine._ids(model, machine.treads, PREFIX)
         self._trunk = int(model.body(PREFIX + machine.trunk).id)
-        self._mass, self._inertia = model.body_mass.copy(), model.body_inertia.copy()
-        self._middle = model.body_ipos[self._trunk].copy()
-        self._gain, self._bias = model.actuator_gainprm.copy(), model.actuator_biasprm.copy()
         self.watch: Callable[[mujoco.MjData], None] | None = None
 
     def apply_build(self, build: Build) -> None:
-        model = self.model
+        model, usual = self.model, self._usual
         model.geom_friction[self._treads, 0] = build.friction
-        model.body_mass[:] = self._mass * build.mass
-        model.body_inertia[:] = self._inertia * build.mass
-        model.body_ipos[self._trunk] = self._middle + build.shift
-        model.actuator_gainprm[:, 0] = self._gain[:, 0] * build.stiffness
-        model.actuator_biasprm[:, 1] = self._bias[:, 1] * build.stiffness
-        model.actuator_biasprm[:, 2] = self._bias[:, 2] * build.damping
+        model.body_mass[:] = usual.body_mass * build.mass
+        model.body_inertia[:] = usual.body_inertia * build.mass
+        model.body_ipos[self._trunk] = usual.body_ipos[self._trunk] + build.shift
+        model.actuator_gainprm[:, 0] = usual.actuator_gainprm[:, 0] * build.stiffness
+        model.actuator_biasprm[:, 1] = usual.actuator_biasprm[:, 1] * build.stiffness
+        model.actuator_biasprm[:, 2] = usual.actuator_biasprm[:, 2] * build.damping
 
     def run(self, body: Body, control: np.ndarray, origin: np.ndarray, build: Build | None, n_steps: int) -> Body:
         """Advance a robot by some steps of physics; its position is from `origin`, in the tunnel frame, m."""

@@ -103,10 +103,6 @@ class Physical(Unicycle):
         params, track = super().in_tunnel(params, tunnel), params.track
         return params.replace(track=track.replace(tunnel=track.tunnel - tunnel))
 
-    def ride(self, own: Any) -> Ride:
-        """Return the robot of the motion's state."""
-        return own
-
     def carried(self, part: Part) -> Part:
         """Return a LiDAR as this robot carries it; other parts as they are."""
         if isinstance(part, SpatialLidar):
@@ -116,7 +112,7 @@ class Physical(Unicycle):
     def moved(
         self,
         state: State,
-        own: Any,
+        own: Ride,
         wheels: Float[Array, "2"],
         clearance: Float[Array, ""],
         contact: Bool[Array, ""],
@@ -125,8 +121,7 @@ class Physical(Unicycle):
         params: EnvParams,
     ) -> Moved:
         """Return the result of a step: see `Moved`; `wheels` is what the robot itself takes for its mean motion."""
-        ride, track = self.ride(own), params.track
-        position, heading = track.position[ride.anchor, :2] + ride.body.qpos[:2], yaw(ride.body.qpos[3:7])
+        position, heading = params.track.position[own.anchor, :2] + own.body.qpos[:2], yaw(own.body.qpos[3:7])
         station = foot(tunnel, position, state.station).station
         outside = (station < -_BEYOND) | (station > tunnel.length + _BEYOND)
         return Moved(
@@ -137,7 +132,7 @@ class Physical(Unicycle):
             clearance=clearance,
             contact=contact | outside,
             fallen=fallen,
-            info={"height": ride.body.qpos[2], "fall": fallen},
+            info={"height": own.body.qpos[2], "fall": fallen},
         )
 
 
@@ -187,7 +182,7 @@ class SwayingLidar(PlanarLidar):
 
     def true_ranges(self, own: Any, sensing: SensingState, params: EnvParams) -> Array:
         """Cast the beams from the trunk, m."""
-        ride = self.motion.ride(sensing.parts[self.motion.name])
+        ride = sensing.parts[self.motion.name]
         origin, turn = lidar_pose(ride, sensing, params.track, self.motion.lidar_place)
         return scan(origin, turn, ride.anchor, sensing, params.track, params.lidar, params.relief)
 
@@ -213,7 +208,7 @@ class SwayingSpatialLidar(SpatialLidar):
         self, own: Any, sensing: SensingState, params: EnvParams
     ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
         """Return origin (m) and direction of each beam, tunnel frame."""
-        sensor, ride = params.lidar, self.motion.ride(sensing.parts[self.motion.name])
+        sensor, ride = params.lidar, sensing.parts[self.motion.name]
         place, turn = lidar_pose(ride, sensing, params.track, self.motion.lidar_place, sensor.mount.lateral)
         ahead, left, up = (tuple(rotate(turn, axis)) for axis in jnp.eye(3))
         directions = into_tunnel(turned((ahead, left, up), sensor.mount), sensor.directions)

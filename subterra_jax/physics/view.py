@@ -57,7 +57,7 @@ class RobotView:
         Raises:
             PictureError: There is no OpenGL.
         """
-        ride = env.motion.ride(state.parts[env.motion.name]) if hasattr(env, "motion") else state
+        ride = state.parts[env.motion.name] if hasattr(env, "motion") else state
         qpos = np.array(ride.body.qpos, np.float64)
         qpos[:3] += np.asarray(self._track.position[ride.anchor], np.float64)
         return self.draw(qpos)

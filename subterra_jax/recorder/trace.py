@@ -149,7 +149,7 @@ class _Legs:
         """Return the pose before the first step, as often as a step has control periods."""
         if self.physics is None:
             return np.zeros((1, 0, N_POSE))
-        walk = state.legs.walk
+        walk = state.legs
         pose = np.array(walk.body.qpos[0], np.float64)
         pose[:3] += np.asarray(params.walk.track.position[walk.anchor[0]], np.float64)
         return np.tile(pose, (1, round(float(params.vehicle.period) / self.physics.period), 1))

@@ -13,7 +13,7 @@ import pytest
 from benchmarks import b2_traverse
 from benchmarks.records import read_records
 from subterra_jax.b2 import tasks
-from subterra_jax.b2.transfer import Lag, LaggedWheels
+from subterra_jax.b2.transfer import LaggedWheels
 from tests.train.conftest import SMALL, TASK, call
 from train import __main__ as navigate
 from train import checkpoint, curve
@@ -86,8 +86,7 @@ def world():
 
 def test_the_stand_in_is_told_what_the_legs_are_told_and_obeys_as_late(world):
     mission, params = tasks.make_mission(policy="trot")
-    assert isinstance(world.env.motion, LaggedWheels)
-    assert world.env.motion.lag == Lag()
+    assert world.env.motion == LaggedWheels()
     assert world.facts["motion"] == "b2"
     bounds, legs = world.env.action_space(world.params), mission.action_space(params)
     np.testing.assert_array_equal(bounds.high, legs.high)

@@ -57,8 +57,8 @@ def changed(env, **fields):
 
 
 def with_body(state, qpos):
-    body = dataclasses.replace(state.legs.walk.body, qpos=jnp.asarray(qpos, jnp.float32))
-    return dataclasses.replace(state.legs, walk=dataclasses.replace(state.legs.walk, body=body))
+    body = dataclasses.replace(state.legs.body, qpos=jnp.asarray(qpos, jnp.float32))
+    return dataclasses.replace(state.legs, body=body)
 
 
 def test_spaces_are_those_of_the_planar_task_and_five_commands_make_a_second(env):
@@ -104,7 +104,7 @@ def test_the_same_seed_gives_the_same_walk_and_another_one_another(env):
 def test_a_fall_ends_the_episode_and_is_no_success(env):
     env.reset(seed=0)
     state = env.unwrapped.state
-    qpos = np.array(state.legs.walk.body.qpos)
+    qpos = np.array(state.legs.body.qpos)
     qpos[3:7] = [np.cos(0.8), np.sin(0.8), 0.0, 0.0]
     changed(env, legs=with_body(state, qpos))
     _, _, terminated, truncated, info = env.step(np.zeros(2, np.float32))
@@ -120,9 +120,9 @@ def test_a_wall_stops_the_robot_and_ends_the_episode(env, plan):
     at = np.argmin(np.abs(plan.station - 2.0))
     lateral = float(plan.half_width[at]) - 0.3
     normal = np.array([-plan.tangent[at, 1], plan.tangent[at, 0]])
-    qpos = np.array(state.legs.walk.body.qpos)
+    qpos = np.array(state.legs.body.qpos)
     qpos[:2] += (lateral - float(state.lateral)) * normal
-    turn = float(yaw(state.legs.walk.body.qpos[3:7])) + 1.2
+    turn = float(yaw(state.legs.body.qpos[3:7])) + 1.2
     qpos[3:7] = [np.cos(turn / 2), 0.0, 0.0, np.sin(turn / 2)]
     changed(env, legs=with_body(state, qpos), lateral=jnp.float32(lateral))
     _, _, terminated, _, info = env.step(np.array([0.8, 0.0], np.float32))

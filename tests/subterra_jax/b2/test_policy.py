@@ -12,7 +12,7 @@ import subterra_jax as st
 from benchmarks import b2_traverse
 from subterra_jax.b2 import gait as gaits
 from subterra_jax.b2 import tasks, transfer
-from subterra_jax.b2.transfer import Lag, Nod, stand_in
+from subterra_jax.b2.transfer import LaggedWheels, NoddingLidar, stand_in
 from subterra_jax.evaluation import listed_episodes
 from subterra_jax.policies import load
 from tests.subterra_jax import placing
@@ -60,13 +60,13 @@ def test_it_walks_as_told_over_sleepers_with_pushes_and_noise(gait, walking, spe
     assert np.abs(strides[..., 2]).mean() < 0.1
 
 
-LAG = Lag(speed=0.6, yaw_rate=0.25, speed_gain=0.9, yaw_rate_gain=0.8)
+LATE = LaggedWheels(lag=(0.6, 0.25), gain=(0.9, 0.8))
 
 
 @pytest.fixture(scope="module")
 def run():
     env, params = st.make("Subterra/TraverseShort-v1", vehicle=tasks.VEHICLE, start=tasks.START)
-    late = stand_in(env, LAG)
+    late = stand_in(env, LATE)
     actions = jnp.asarray(np.repeat(np.random.default_rng(0).uniform([0.0, -0.3], [0.8, 0.3], (8, 2)), 6, axis=0))
 
     @jax.jit
@@ -84,7 +84,7 @@ def run():
 
 def test_a_step_of_the_command_is_followed_exponentially(run):
     actions, told = run
-    expected = LAG.speed_gain * actions[0, 0] * (1.0 - np.exp(-0.2 * np.arange(1, 7) / LAG.speed))
+    expected = LATE.gain[0] * actions[0, 0] * (1.0 - np.exp(-0.2 * np.arange(1, 7) / LATE.lag[0]))
     np.testing.assert_allclose(told[:6, 0], expected, rtol=1e-4)
 
 
@@ -96,8 +96,8 @@ def test_the_robot_moves_as_fast_as_its_lagged_command_says(run):
 
 def test_beams_that_point_down_end_on_the_ballast_and_no_others_change():
     env, params = st.make("Subterra/TraverseShort-v1", vehicle=tasks.VEHICLE, start=tasks.START)
-    level = stand_in(env, nod=Nod(0.0, 0.0, 0.0))
-    nose_down = stand_in(env, nod=Nod(0.1, 0.0, 0.0, height=0.75))
+    level = stand_in(env, lidar=NoddingLidar((0.0, 0.0, 0.0)))
+    nose_down = stand_in(env, lidar=NoddingLidar((0.1, 0.0, 0.0)))
     key = jax.random.key(0)
     (flat, _), (bent, _) = (jax.jit(one.reset)(key, params) for one in (level, nose_down))
     assert float(bent[0]) == pytest.approx(0.75 / np.sin(0.1), rel=1e-5)
