@@ -8,7 +8,7 @@ from scene.cleaning.sort import Cleaned, end_stations
 from scene.cleaning.tube import Tube as WallTube
 from scene.cleaning.tube import measure_tube
 from scene.errors import Cause, FitError
-from scene.fitting.unroll import Grid, fill_holes, fill_nearest
+from scene.fitting.unroll import Grid, cell_medians, fill_holes, fill_nearest
 from scene.geometry import Around
 from tests.scene import fits
 from tests.scene.fits import thin
@@ -179,6 +179,12 @@ def test_what_is_no_bore_is_refused_by_its_name(make, code):
     with pytest.raises(FitError) as raised:
         cleaned(make(np.random.default_rng(4)) + PLACE)
     assert raised.value.code in (code if isinstance(code, tuple) else (code,))
+
+
+def test_returns_beyond_64_m_count_as_so_far_in_their_own_cell():
+    grid = Grid.over(0.0, 2.0, 0.5, 8)
+    found = cell_medians(grid, np.array([3, 3, 3, 4]), np.array([100.0, 90.0, 80.0, 5.0])).ravel()
+    np.testing.assert_allclose(found[3:5], [64.0, 5.0], atol=1e-3)
 
 
 def test_a_wall_unseen_beside_a_train_goes_on_as_before_and_behind():

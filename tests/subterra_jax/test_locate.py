@@ -240,6 +240,18 @@ def test_a_map_of_another_tunnel_is_not_believed():
     assert float(kept.log_scale) == pytest.approx(-1.0)
 
 
+def test_a_belief_widens_as_the_localiser_says_and_the_truth_is_looked_up_between_its_cells():
+    weights = map_filter.init(jax.random.key(0)) | {"leak": jnp.array(-30.0)}
+    two_metres = jnp.zeros(len(map_filter.SHIFTS)).at[map_filter.SIDE + 10].set(1.0)
+    begun = map_filter.MapBelief(two_metres, jnp.zeros(()))
+    now = map_filter.advance(weights, begun, jnp.zeros_like(two_metres), jnp.float32(0.5))
+    assert np.asarray(now.share) @ (map_filter.SHIFTS - 2.0) ** 2 == pytest.approx(0.003 * np.e, rel=1e-3)
+    beside = 0.003 * np.e / map_filter.CELL**2 / 2
+    found = [float(map_filter.likelihood(now, jnp.float32(2.05), jnp.asarray(right))) for right in (True, False)]
+    between = 0.75 * (1.0 - 2.0 * beside) + 0.25 * beside
+    np.testing.assert_allclose(found, np.log([0.5 * between, 0.5]), rtol=1e-3)
+
+
 def test_a_strip_gives_the_walls_of_its_tunnel_and_says_where_it_ends():
     strip = map_of_walls(n_metres=20)
     wall, inside = strip.pick(0).sample(jnp.float32(-1.0), 300)

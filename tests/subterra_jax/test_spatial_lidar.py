@@ -146,11 +146,11 @@ def test_a_sweep_of_the_vlp16_falls_on_the_walls_only_when_deskewed_with_the_tru
 
 
 def test_noise_grows_with_range_and_incidence_as_it_says():
-    params, n = echo.EchoParams(), 40_000
+    params, n = echo.EchoParams(sigma_slant=0.02), 40_000
     normal = jax.random.normal(jax.random.key(0), (n,))
     for metres, cosine, tangent in ((2.0, 1.0, 0.0), (60.0, np.cos(1.2), np.tan(1.2)), (5.0, 1e-4, 10.0)):
         seen = echo.add_noise(jnp.full(n, metres), jnp.full(n, cosine), normal, params)
-        expected = np.sqrt(0.019**2 + (1e-4 * metres) ** 2 + (0.002 * tangent) ** 2)
+        expected = np.sqrt(0.019**2 + (1e-4 * metres) ** 2 + (0.02 * tangent) ** 2)
         assert np.std(np.asarray(seen) - metres) == pytest.approx(expected, rel=0.02)
 
 

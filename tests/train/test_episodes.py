@@ -2,8 +2,10 @@
 
 import json
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from train import curve
 from train.driver import Policy
@@ -50,20 +52,30 @@ def test_the_window_holds_exactly_the_last_hundred_episodes():
     assert window.count == len(every) > 200
 
 
-def test_more_episodes_than_there_is_room_for_are_fetched_all_the_same():
+def in_parts(unroll, n_parts):
+    """The report of an unroll whose environments are shared out over devices."""
+    if n_parts == 1:
+        return Report(unroll, in_a_row(unroll), {}, None)
+    parts = jax.tree.map(lambda x: jnp.stack(jnp.split(x, n_parts, axis=1)), unroll)
+    return Report(parts, jax.vmap(in_a_row)(parts), {}, None)
+
+
+@pytest.mark.parametrize("n_parts", [1, 2])
+def test_more_episodes_than_there_is_room_for_are_fetched_all_the_same(n_parts):
     unroll = random_unroll(np.random.default_rng(3), n_steps=64, n_envs=40, p_done=0.5)
-    small = in_a_row(unroll)
-    assert int(small.count) > len(small.index)
-    ((ended, _),) = fetch(Report(unroll, small, {}, None))
+    given = in_parts(unroll, n_parts)
+    assert (np.asarray(given.ended.count) > given.ended.index.shape[-1]).all()
+    ((ended, _),) = fetch(given)
     time, env = np.nonzero(unroll.done)
     np.testing.assert_array_equal(ended.index, time * 40 + env)
     np.testing.assert_array_equal(ended.coverage, unroll.coverage[time, env])
     np.testing.assert_array_equal(ended.contact, ~np.asarray(unroll.success)[time, env])
 
 
-def test_few_episodes_are_the_same_rows_without_the_unroll():
+@pytest.mark.parametrize("n_parts", [1, 2])
+def test_few_episodes_are_the_same_rows_without_the_unroll(n_parts):
     unroll = random_unroll(np.random.default_rng(4), n_steps=64, n_envs=40, p_done=0.02)
-    ((ended, _),) = fetch(Report(unroll, in_a_row(unroll), {}, None))
+    ((ended, _),) = fetch(in_parts(unroll, n_parts))
     time, env = np.nonzero(unroll.done)
     np.testing.assert_array_equal(ended.index, time * 40 + env)
     np.testing.assert_array_equal(ended.length, unroll.length[time, env])

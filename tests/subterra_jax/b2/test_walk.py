@@ -47,6 +47,17 @@ def test_the_zero_action_walks_over_sleepers_at_three_quarters_of_what_is_asked(
     assert np.abs(np.asarray(state.body.qpos[:, :2])).max() < 1.5
 
 
+def test_a_new_command_comes_once_in_its_hold_on_average(walking):
+    often = walking.params.replace(command=walking.params.command.replace(hold=jnp.float32(0.2)))
+    _, state = walking.reset(3, often)
+    came = []
+    for k in range(50):
+        before = np.asarray(state.drawn_command)
+        _, state, *_ = walking.step(900 + k, state, params=often)
+        came.append((np.asarray(state.drawn_command) != before).any(axis=1))
+    assert 0.05 < np.mean(came) < 0.18  # a tenth of 400, less those that ask to stand twice
+
+
 def test_terms_of_the_reward_sum_to_the_reward_and_the_info_has_the_contract_s_keys(walking):
     _, state = walking.reset(1)
     _, _, reward, _, _, info = walking.step(1, state)
