@@ -6,6 +6,7 @@ Each ball or wheel meets the tangent planes of what is nearest to it, so that th
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +20,7 @@ from subterra_jax.parts.unicycle import nearest_wall
 from subterra_jax.physics.rotations import inverse, rotate
 from subterra_jax.tunnel import Tunnel
 from subterra_jax.tunnel.plan import TunnelPlan
+from subterra_jax.tunnel.shell import Shell
 
 SPACING = 0.6  # of sleepers, and of the rows of a floor without; the paper's, m
 SLEEPER_HALF = (0.10, 1.25)  # half the width of its top, half its length, m; docs/formats.md
@@ -75,7 +77,7 @@ def read_track(plan: TunnelPlan) -> Track:
         station=put(station),
         position=put(tops),
         quaternion=put(turns),
-        protrusion=put((_protrusion(tops, bricks) if sleepers else 0.0) * rows),
+        protrusion=put((_protrusion(tops, bricks, plan.shell) if sleepers else 0.0) * rows),
         rails=put(float(sleepers) * rows),
         first=put(0.0 * rows, np.int32),
         last=put((len(rows) - 1) * rows, np.int32),
@@ -126,17 +128,27 @@ def _quaternions(axes: Float[np.ndarray, "k 3 3"]) -> Float[np.ndarray, "k 4"]:
     return Rotation.from_matrix(matrices).as_quat()[:, [3, 0, 1, 2]] if len(axes) else np.zeros((0, 4))
 
 
-def _protrusion(tops: Float[np.ndarray, "k 3"], bricks: np.ndarray) -> float:
-    """Median height of the sleepers' tops over the slab of ballast nearest to each; 0.06 m where there is none."""
+def _protrusion(tops: Float[np.ndarray, "k 3"], bricks: np.ndarray, shell: Any) -> float:
+    """Median height of the sleepers' tops over the slab of ballast nearest to each, or over the bare floor, m."""
     beds = bricks[(bricks[:, 12] == 0.0) & (np.linalg.norm(bricks[:, 6:9], axis=1) > _SLAB)]
-    if len(beds) == 0:
-        return 0.06
     heights = []
     for top in tops:
+        if len(beds) == 0:
+            heights.append(_over_floor(top, shell))
+            continue
         bed = beds[int(np.argmin(np.sum((beds[:, :2] - top[:2]) ** 2, axis=1)))]
         half = float(np.linalg.norm(bed[9:12]))
         heights.append(float((top - bed[:3]) @ bed[9:12]) / half - half)
     return max(float(np.median(heights)), 0.0)
+
+
+def _over_floor(point: Float[np.ndarray, "3"], shell: Shell) -> float:
+    """Height of a point over the lower half of the nearest section, m."""
+    row = int(np.argmin(np.sum((shell.position[:, :2] - point[:2]) ** 2, axis=1)))
+    away, low = point - shell.position[row], np.flatnonzero(np.sin(shell.angle) < 0.0)
+    across, height = (shell.radius[row, low] * turn(shell.angle[low]) for turn in (np.cos, np.sin))
+    order = np.argsort(across)
+    return float(away @ shell.up[row] - np.interp(away @ shell.left[row], across[order], height[order]))
 
 
 @struct.dataclass
