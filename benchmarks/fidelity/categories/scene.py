@@ -284,7 +284,8 @@ def mj_inertia_valid(case: Case) -> Value:
         for body in mujoco.MjSpec.from_file(str(case.candidate.scene)).bodies
     }
     mass = {model.body(k).name: float(model.body_mass[k]) for k in moving}
-    off = [n for n, m in mass.items() if np.isfinite(stated[n]) and abs(m - stated[n]) > _MASS_TOLERANCE * stated[n]]
+    # Geoms without a mass leave it to the body's own inertia, as the rover's do.
+    off = [n for n, m in mass.items() if stated[n] > 0.0 and abs(m - stated[n]) > _MASS_TOLERANCE * stated[n]]
     valid = possible and not off and min(mass.values()) > 0
     return pass_or_fail(valid, ", ".join(f"{n} {m:g} kg" for n, m in mass.items()))
 

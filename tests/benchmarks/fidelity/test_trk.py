@@ -160,10 +160,12 @@ def test_a_sleeper_less_than_the_manifest_says_is_told(rewritten):
     assert "sleepers: 19 of 20" in value.reason
 
 
-def test_a_robot_heavier_than_it_states_is_invalid(rewritten):
-    heavier = '</freejoint><inertial pos="0 0 0" mass="25" diaginertia="1 1 1"/>'
-    case = rewritten("<freejoint/>", heavier.replace("</freejoint>", "<freejoint/>"))
-    assert measure("mj_inertia_valid", case).value == 0.0
+@pytest.mark.parametrize(("mass", "valid"), [(20, 0.0), (0, 1.0)])
+def test_a_robot_heavier_than_its_geoms_state_is_invalid(rewritten, mass, valid):
+    own = '<freejoint/><inertial pos="0 0 0" mass="25" diaginertia="1 1 1"/>'
+    ball = '<geom name="ball" type="sphere" size="0.3" mass="{}"'
+    case = rewritten(f"<freejoint/>\n{ball.format(20)}", f"{own}\n{ball.format(mass)}")
+    assert measure("mj_inertia_valid", case).value == valid
 
 
 def test_a_scene_without_a_robot_fails_the_step(rewritten):
