@@ -1,25 +1,36 @@
-"""The command `python -m train`: its run folder, refusals to overwrite, Ctrl-C, curves."""
+"""The trainer's command, and training of the walking robot: settings, networks, scores and release."""
 
+import dataclasses
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
+import types
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import subterra_jax as st
 from benchmarks import b2_traverse
 from benchmarks.records import read_records
+from subterra_jax.b2 import gait as gaits
 from subterra_jax.b2 import tasks
 from subterra_jax.b2.transfer import LaggedWheels
+from subterra_jax.host.errors import OutputError
+from subterra_jax.policies.files import PolicyError
 from tests.train.conftest import SMALL, TASK, call
 from train import __main__ as navigate
-from train import checkpoint, curve
+from train import checkpoint, curve, walk
 from train.__main__ import read_command
 from train.b2 import embodied
+from train.b2.walking import WalkConfig, WalkDriver, make_walk_config, score
 from train.config import ConfigError
+from train.driver import Policy
+from train.policies import write_tensors
 
 
 def test_a_run_folder_holds_everything(trained):
@@ -115,3 +126,131 @@ def test_a_policy_learnt_on_the_stand_in_drives_robots_on_legs(tmp_path):
     b2_traverse.command(asked)
     told = {record.id.rpartition("/")[2]: record.value for record in read_records(asked.out)}
     assert (told["success"], told["fall"], told["robots"]) == (100.0, 0.0, 4.0)
+
+
+N_SEEN, N_TRUTH = 56, 12
+
+
+@pytest.fixture(scope="module")
+def driver():
+    space = lambda n: types.SimpleNamespace(low=-np.ones(n, np.float32), high=np.ones(n, np.float32))  # noqa: E731
+    env = types.SimpleNamespace(action_space=lambda _: space(12), observation_size=lambda _: N_SEEN + N_TRUTH)
+    return WalkDriver(env, None, WalkConfig(hidden=(32, 16)), N_SEEN)
+
+
+@pytest.fixture(scope="module")
+def policy(driver):
+    shapes = jax.eval_shape(driver.init, jax.random.key(0))
+    keys = iter(jax.random.split(jax.random.key(0), 100))
+    random = jax.tree.map(lambda leaf: 0.3 * jax.random.normal(next(keys), leaf.shape), shapes)
+    mean = jnp.linspace(-1.0, 1.0, N_SEEN + N_TRUTH)
+    return Policy(random, statistics={"mean": mean, "std": jnp.full(N_SEEN + N_TRUTH, 2.0)})
+
+
+def answer(driver, policy, seen):
+    return driver.answer(policy, driver.inputs(policy, seen), driver.start_memory(seen.shape[:1]))[0]
+
+
+def records(n_steps=200, n_robots=4, speed=0.5, asked=0.6):
+    velocity, expected = np.zeros((n_steps, n_robots, 3)), np.zeros((n_steps, n_robots, 3))
+    velocity[..., 0], expected[..., 0] = speed, asked
+    flags = {name: np.zeros((n_steps, n_robots), bool) for name in ("fall", "over", "contact")}
+    return {"velocity": velocity, "asked": expected, "effort": np.full((n_steps, n_robots), 300.0), **flags}
+
+
+def test_the_policy_does_not_see_the_truth_and_the_critic_does(driver, policy):
+    seen = jax.random.normal(jax.random.key(2), (3, N_SEEN + N_TRUTH))
+    one, other = answer(driver, policy, seen), answer(driver, policy, seen.at[:, N_SEEN:].add(1.0))
+    np.testing.assert_array_equal(one.mean, other.mean)
+    assert not np.allclose(one.value, other.value)
+
+
+def test_a_released_gait_acts_as_the_one_that_was_trained(driver, policy, tmp_path):
+    out = tmp_path / "gait.safetensors"
+    write_tensors(out, driver.kind, driver.layout, driver.tensors(policy), {"task": "Subterra/B2Walk-v1", "world": {}})
+    loaded, facts = gaits.load_policy(out)
+    seen = jax.random.normal(jax.random.key(3), (5, N_SEEN + N_TRUTH))
+    expected = driver.action(answer(driver, policy, seen).mean)
+    np.testing.assert_allclose(loaded.act(seen[:, :N_SEEN]), expected, atol=1e-6)
+    assert facts["kind"] == "walk"
+    assert loaded.n_observation == N_SEEN
+    gaits.check_fits(loaded, N_SEEN, out)
+    with pytest.raises(PolicyError, match="made for observations of 56 numbers, the B2 gives 60"):
+        gaits.check_fits(loaded, 60, out)
+
+
+def test_statistics_of_the_observation_are_those_of_what_was_seen(driver, policy):
+    seen = jax.random.normal(jax.random.key(4), (5, N_SEEN + N_TRUTH))
+    np.testing.assert_allclose(driver.raw(driver.inputs(policy, seen), policy), seen, atol=1e-5)
+
+
+def test_a_missing_gait_is_refused_by_name(tmp_path):
+    with pytest.raises(PolicyError, match="no such policy"):
+        gaits.load_policy(tmp_path / "none.safetensors")
+
+
+def test_a_policy_that_is_no_gait_is_refused(driver, policy, tmp_path):
+    out = tmp_path / "gait.safetensors"
+    write_tensors(out, driver.kind, driver.layout, driver.tensors(policy), {"task": "Subterra/B2Walk-v1", "world": {}})
+    facts = out.with_suffix(".json")
+    facts.write_text(json.dumps({**json.loads(facts.read_text()), "kind": "ppo"}))
+    with pytest.raises(PolicyError, match="kind 'ppo', which is no gait"):
+        gaits.load_policy(out)
+
+
+def test_a_constant_lag_is_scored_as_what_it_is():
+    found = score(records(), 0.02)
+    assert found["velocity_error"] == pytest.approx(0.1)
+    assert found["yaw_rate_error"] == 0.0
+    assert found["falls"] == 0.0
+    assert found["power"] == pytest.approx(300.0)
+
+
+def test_swaying_within_a_stride_is_no_tracking_error():
+    swaying = records(speed=0.6)
+    swaying["velocity"][..., 1] = 0.3 * np.sin(2.0 * np.pi * np.arange(200) / 20.0)[:, None]
+    assert score(swaying, 0.02)["velocity_error"] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_one_fall_of_four_is_a_quarter_and_what_comes_after_it_does_not_count():
+    fallen = records()
+    fallen["fall"][100, 2] = True
+    fallen["over"][101:, 2] = True
+    fallen["velocity"][101:, 2] = 50.0
+    fallen["effort"][101:, 2] = 1e9
+    found = score(fallen, 0.02)
+    assert found["falls"] == 0.25
+    assert found["velocity_error"] == pytest.approx(0.1)
+    assert found["power"] == pytest.approx(300.0)
+
+
+def test_settings_that_make_no_sense_are_refused_before_anything_is_compiled(tmp_path):
+    with pytest.raises(ConfigError, match="robots must be at least 1, got 0"):
+        walk.command(walk.Command(out=tmp_path / "run", robots=0))
+    with pytest.raises(ConfigError, match="n_envs = 100 cannot be divided into minibatches = 32"):
+        walk.command(walk.Command(out=tmp_path / "run", config=WalkConfig(n_envs=100)))
+    with pytest.raises(OutputError, match=r"must end in \.safetensors"):
+        walk.command(walk.Command(out=tmp_path / "run", release=tmp_path / "gait.bin"))
+    with pytest.raises(ConfigError, match="either a tunnel or a scene"):
+        walk.command(walk.Command(out=tmp_path / "run", tunnel=tmp_path / "t.npz", scene=tmp_path))
+    with pytest.raises(ConfigError, match="unknown preset 'tpu'"):
+        walk.read_command(["--out", str(tmp_path / "run"), "--preset", "tpu"])
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_critic_s_observation_is_the_policy_s_and_more():
+    env, params = st.make("Subterra/B2Walk-v1", privileged=True)
+    plain = dataclasses.replace(env, privileged=False)
+    assert plain.observation_size(params) == N_SEEN
+    assert env.observation_size(params) == N_SEEN + N_TRUTH
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_it_learns_on_a_cpu(tmp_path):
+    config = dataclasses.replace(make_walk_config("cpu"), steps=600_000)
+    assert walk.command(walk.Command(out=tmp_path / "run", robots=32, config=config)) == 0
+    lines = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+    paid = np.array([line["reward_velocity"] + line["reward_yaw_rate"] for line in lines])
+    assert paid[-10:].mean() > paid[10:20].mean() * 1.02
+    assert (tmp_path / "run" / "evaluation.json").exists()

@@ -1,15 +1,24 @@
-"""Stable-Baselines3 trains on the adapter, and its own wrappers and conventions hold."""
+"""Stable-Baselines3 trains on the adapter, its conventions hold, and scans in three dimensions are images."""
 
 import copy
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
+import subterra_jax as st
+from subterra_jax.adapters.kernel import as_observation, compile_as_one_kernel, pack, start_streams
 from subterra_jax.adapters.sb3 import SubterraVecEnv
 from subterra_jax.adapters.single import SubterraEnv
+from subterra_jax.adapters.task import Task
+from subterra_jax.parts import make_sensor
+from subterra_jax.parts.part import Boxes
+from subterra_jax.pictures import top_down as drawing
+from subterra_jax.pictures.views import make_view
 
 TASK, HORIZON = "Subterra/TraverseShort-v1", 24
 ACTIONS = np.array([[1.0, 0.0], [2.0, 1.5]], np.float32)
@@ -87,3 +96,127 @@ def test_a_task_with_named_fields_suits_the_policy_for_dicts():
     task = "Subterra/StopAtShort-v1"
     assert set(SubterraVecEnv(2, task).observation_space.keys()) >= {"ranges", "odometry", "goal"}
     assert SubterraVecEnv(2, task, flat=True).observation_space.shape == (21,)
+
+
+def world():
+    """A straight tunnel and a small image, for quick compiling."""
+    xy = np.stack([np.linspace(0.0, 40.0, 41), np.zeros(41)], axis=-1)
+    made = make_sensor("spin16x64")
+    rays = np.asarray(made.directions).reshape(16, 64, 3)[::4, ::8].reshape(-1, 3)
+    sensor = make_sensor(rays, shape=(4, 8))
+    return {"tunnel": st.tunnel.from_centreline(xy, 2.8), "sensor": sensor}
+
+
+def test_spaces_and_observations_have_the_shape_of_the_image():
+    task = Task(*st.make(TASK, **world()))
+    assert task.observation_space["scan"].shape == (4, 8)
+    vector = np.arange(3 * 34, dtype=np.float32).reshape(3, 34)
+    seen = as_observation(vector, task.fields)
+    assert seen["scan"].shape == (3, 4, 8)
+    assert seen["odometry"].shape == (3, 2)
+    np.testing.assert_array_equal(seen["scan"][1, 2], vector[1, 16:24])
+    assert Task(*st.make(TASK, tunnel=world()["tunnel"])).fields is None
+
+
+@pytest.mark.slow
+def test_one_environment_and_a_batch_give_the_same_images_within_their_space():
+    env = SubterraEnv(TASK, **world())
+    obs, _ = env.reset(seed=3)
+    assert list(obs) == ["scan", "odometry"]
+    assert obs["scan"].shape == (4, 8)
+    assert env.observation_space["scan"].shape == (4, 8)
+    after, *_ = env.step(np.array([1.0, 0.0], np.float32))
+    assert env.observation_space.contains(after)
+    assert np.ptp(after["scan"]) > 1.0
+    sb3 = pytest.importorskip("stable_baselines3")
+    from subterra_jax.adapters.sb3 import SubterraVecEnv
+
+    envs = SubterraVecEnv(2, TASK, **world())
+    envs.seed(3)
+    batch = envs.reset()
+    assert batch["scan"].shape == (2, 4, 8)
+    np.testing.assert_allclose(batch["scan"][0], obs["scan"], atol=1e-3)
+    policy = sb3.PPO("MultiInputPolicy", envs, n_steps=8, batch_size=8, device="cpu")
+    action, _ = policy.predict(batch)
+    assert action.shape == (2, 2)
+
+
+def colours(picture):
+    assert picture.shape == (480, 480, 3)
+    assert picture.dtype == np.uint8
+    return {tuple(int(c) for c in colour) for colour in np.unique(picture.reshape(-1, 3), axis=0)}
+
+
+@pytest.fixture(scope="module")
+def begun():
+    env, params = st.make("Subterra/Obstructed-v1", "subterra-351")
+    obs, state = jax.device_get(jax.jit(env.reset)(jax.random.key(1), params))
+    return env, params, state, obs
+
+
+def at(begun, station):
+    """The picture with the robot elsewhere on the centreline."""
+    env, params, state, obs = begun
+    row = round(station / float(params.tunnel.spacing))
+    moved = state.replace(position=np.asarray(params.tunnel.grid[row, :2]), station=np.float32(station))
+    return colours(make_view("top").picture(env, params, moved, obs))
+
+
+def test_the_plan_shows_walls_beams_and_robot(begun):
+    assert at(begun, 0.0) >= {drawing.BACKGROUND, drawing.WALL, drawing.BEAM, drawing.ROBOT}
+
+
+def test_the_goal_and_the_boxes_are_shown_where_they_are_near(begun):
+    goal = float(begun[2].goal.station)
+    assert drawing.GOAL in at(begun, goal - 5.0)
+    assert drawing.GOAL not in at(begun, goal - 20.0 if goal > 30.0 else goal + 20.0)
+    start = float(begun[2].station)  # boxes stand ahead of it
+    assert any(drawing.BOX in at(begun, start + ahead) for ahead in (15.0, 30.0, 45.0))
+
+
+def test_a_box_and_a_goal_are_drawn_where_they_are():
+    boxes = Boxes(centre=np.array([[3.0, 4.0]]), axis=np.array([[0.0, 1.0]]), half=np.array([[1.0, 0.5]]))
+    goal = np.array([[-5.0, -2.0], [-5.0, 2.0]])
+    picture = drawing.top_down(
+        np.zeros((0, 2)), np.zeros(2), 0.0, 0.4, np.zeros(4), view=24.0, size=240, goal=goal, boxes=[boxes]
+    )
+    rows, columns = np.nonzero((picture == drawing.BOX).all(axis=2))
+    x, y = (columns + 0.5 - 120) / 10, (120 - rows - 0.5) / 10
+    assert [x.min(), x.max(), y.min(), y.max()] == pytest.approx([2.5, 3.5, 3.0, 5.0], abs=0.11)
+    rows, columns = np.nonzero((picture == drawing.GOAL).all(axis=2))
+    assert np.ptp(rows) == pytest.approx(40, abs=2)
+    assert np.abs((columns + 0.5 - 120) / 10 + 5.0).max() < 0.2
+
+
+def test_a_leaf_of_another_width_is_refused():
+    with pytest.raises(TypeError, match="float16"):
+        pack({"half": jnp.zeros(2, jnp.float16)})
+
+
+def test_a_function_of_many_operations_becomes_one_call_with_the_same_result():
+    def many(x):
+        key = jax.random.wrap_key_data(jnp.array([0, 7], jnp.uint32))
+        noisy = x + jax.random.normal(key, x.shape)
+        return jnp.cumsum(jnp.sin(noisy)), jnp.min(jnp.abs(noisy), keepdims=True)
+
+    x = np.linspace(0.0, 1.0, 300, dtype=np.float32)
+    compiled = compile_as_one_kernel(many, x)
+    for got, expected in zip(compiled(x), jax.jit(many)(x), strict=True):
+        np.testing.assert_allclose(got, expected, rtol=1e-6, atol=1e-6)  # sums of numbers of order one
+    entry = compiled.as_text().split("ENTRY", 1)[1]
+    assert "fusion(" not in entry
+    assert entry.count(" call(") == 1
+
+
+def test_what_cannot_be_one_kernel_is_compiled_in_the_usual_way():
+    x = np.array([3.0, 1.0, 2.0], np.float32)
+    np.testing.assert_array_equal(compile_as_one_kernel(jnp.sort, x)(x), [1.0, 2.0, 3.0])
+
+
+def test_seeds_begin_different_streams_and_only_legal_seeds_are_taken():
+    streams = start_streams([0, 1, 2**32, None, None], np.random.default_rng(0))
+    assert len(np.unique(streams, axis=0)) == 5
+    np.testing.assert_array_equal(streams[2], [1, 0])
+    for seed in (-1, 2**64):
+        with pytest.raises(ValueError, match=str(seed)):
+            start_streams([seed], np.random.default_rng(0))
