@@ -22,11 +22,11 @@ from scipy.stats import binomtest
 import subterra_jax as st
 from benchmarks.command import BenchmarkError, require_least, run_main
 from benchmarks.records import Record, measured, write_records
-from subterra_jax.b2 import tasks, transfer
+from subterra_jax.b2 import transfer
 from subterra_jax.b2.gait import RELEASED
 from subterra_jax.evaluation import Episodes
 from subterra_jax.host.files import require_file
-from subterra_jax.host.task_ids import full_id
+from subterra_jax.host.task_ids import B2_TRAVERSE, full_id
 from subterra_jax.policies.opening import open_agent
 from subterra_jax.policies.trained import Trained
 from subterra_jax.tunnel.sources import load_tunnel
@@ -100,7 +100,7 @@ def _open(arguments: Command) -> tuple[Any, Any]:
     if arguments.robot != "wheels":
         options |= {"scene": arguments.scene, "engine": arguments.engine}
     if arguments.robot == "b2":
-        return tasks.make_mission(policy=arguments.policy, **options)
+        return st.make(B2_TRAVERSE, policy=arguments.policy, **options)
     id = full_id(arguments.task.removeprefix("Subterra/").removesuffix("-v1"))
     if id == "Subterra/Traverse-v1":
         options["horizon"] = _HORIZON

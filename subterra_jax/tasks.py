@@ -176,8 +176,7 @@ def make(
 
     Args:
         id: A key of `TASKS`; `MODULE:ID` or `FILE.py:ID` for a task of one's own; or `Subterra/B2Walk-v1` or
-            `Subterra/B2Traverse-v1`, whose further arguments are those of `subterra_jax.b2.tasks.make` and
-            `subterra_jax.b2.tasks.make_mission`.
+            `Subterra/B2Traverse-v1`, whose further arguments `subterra_jax.b2.tasks.make` and `on_legs` say.
         tunnel: A tunnel file, a name as for `load_tunnel`, a plan from it, a list of such, of which each episode draws
             one, or a ready `Tunnel`, one or several, which is taken as it is, neither cut to the task's piece nor given
             another lining. None is `open:train:0-11`, twelve tunnels of the open world of which each episode draws
@@ -217,7 +216,7 @@ def make(
     id = find(id)
     if motion not in MOTIONS or (motion != MOTIONS[0] and id not in TASKS):
         raise ValueError(f"{id} has no motion {motion!r}; it has {', '.join(MOTIONS) if id in TASKS else 'legs'}")
-    if motion == ROVER and overrides.get("scene") is not None:
+    if (motion == ROVER or id in MISSIONS) and overrides.get("scene") is not None:
         if tunnel is not None:
             raise ValueError(f"either a tunnel or a scene, got both {str(tunnel)!r} and {str(overrides['scene'])!r}")
         tunnel = Path(overrides["scene"]) / "tunnel.npz"
@@ -232,9 +231,8 @@ def make(
             raise ValueError(f"{id} happens in one tunnel: give its name, its file or its plan")
         if id == WALK:
             _require_planar(id, sensor, sweep)
-            return walking.make(id, tunnel, lining, **overrides)
-        return walking.make_mission(id, tunnel, lining, sensor=sensor, sweep=sweep, **overrides)
-    task = TASKS[id]
+            return walking.make(tunnel, lining, **overrides)
+    task = TASKS[id] if id in TASKS else Task(Traverse(), walking.HORIZON)
     spatial = not is_planar(sensor)
     check_dial(texture)
     channels: dict[str, Any] = {"intensity": intensity} if intensity else {}
@@ -257,6 +255,8 @@ def make(
         from subterra_jax.physics import rolling  # MuJoCo is loaded only where physics is meant
 
         env, entries = rolling.on_rover(env, tunnel, lining, task.piece, {**task.params, **overrides}, hidden_start)
+    elif id in MISSIONS:
+        env, entries = walking.on_legs(env, tunnel, lining, overrides)
     else:
         entries = collect_entries(env, {**task.params, **overrides})
     check_robot(entries)

@@ -10,11 +10,11 @@ import jax
 from subterra_jax.adapters.kernel import first_cpu
 from subterra_jax.adapters.single import SubterraEnv
 from subterra_jax.adapters.task import Task, check_mode
-from subterra_jax.b2 import tasks
 from subterra_jax.host.task_ids import B2_TRAVERSE, WALK
 from subterra_jax.physics.stage import scene_file
 from subterra_jax.physics.view import RobotView
 from subterra_jax.pictures.camera import TunnelChoice
+from subterra_jax.tasks import make
 from subterra_jax.tunnel.plan import TunnelPlan
 
 
@@ -38,7 +38,7 @@ class B2Env(SubterraEnv):
         render_mode: `None` or `rgb_array`.
         width: Width of a picture, pixels.
         height: Height of a picture, pixels.
-        **options: As for `tasks.make_mission`: `policy`, `sensor` and so on; or as for `tasks.make`.
+        **options: As for `subterra_jax.make`: `policy`, `sensor` and so on.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 5}  # noqa: RUF012  as Gymnasium declares it
@@ -56,7 +56,6 @@ class B2Env(SubterraEnv):
         **options: Any,
     ):
         check_mode(render_mode)
-        make: Any = tasks.make if task == WALK else tasks.make_mission
         with jax.default_device(first_cpu()):
             env, params = make(task, tunnel, lining, scene=scene, engine="mujoco", **options)
         self.metadata = {**self.metadata, "render_fps": 50 if task == WALK else 5}

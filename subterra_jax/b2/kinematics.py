@@ -5,6 +5,7 @@ order of `constants.LEGS`, joints in that of `constants.PARTS`. Feet are points 
 their leg's abduction axis.
 """
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -51,7 +52,7 @@ def joint_angles(feet: Float[Array, "4 3"]) -> Float[Array, "4 3"]:
 
 def foot_velocities(angles: Float[Array, "4 3"], speeds: Float[Array, "4 3"]) -> Float[Array, "4 3"]:
     """Computes the velocities of the feet relative to the trunk (m/s) from joint speeds (rad/s)."""
-    return jnp.sum(_jacobian(angles) * speeds[:, None, :], axis=2)
+    return jax.jvp(foot_positions, (angles,), (speeds,))[1]
 
 
 def load_torques(angles: Float[Array, "4 3"], load: Float[Array, "4"]) -> Float[Array, "4 3"]:
@@ -59,7 +60,7 @@ def load_torques(angles: Float[Array, "4 3"], load: Float[Array, "4"]) -> Float[
 
     The trunk is taken to be level and the legs weightless. Source: virtual work, torque = -Jᵀ force.
     """
-    return -_jacobian(angles)[:, 2, :] * load[:, None]
+    return -jax.vjp(foot_positions, angles)[1](load[:, None] * jnp.array([0.0, 0.0, 1.0]))[0]
 
 
 def standing_pose() -> tuple[Float[Array, "12"], Float[Array, "12"]]:
@@ -67,21 +68,3 @@ def standing_pose() -> tuple[Float[Array, "12"], Float[Array, "12"]]:
     pose = jnp.array([[b2.STAND[part] for part in b2.PARTS]] * len(b2.LEGS))
     quarter = jnp.full(len(b2.LEGS), b2.TOTAL_MASS * b2.GRAVITY / len(b2.LEGS))
     return pose.reshape(-1), (pose + load_torques(pose, quarter) / STIFFNESS).reshape(-1)
-
-
-def _jacobian(angles: Float[Array, "4 3"]) -> Float[Array, "4 3 3"]:
-    """Derivatives of x, y and z of each foot by its three angles, m/rad."""
-    hip, thigh, calf = angles[:, 0], angles[:, 1], angles[:, 2]
-    foot = foot_positions(angles)
-    shank_x, shank_depth = -b2.LINK * jnp.sin(thigh + calf), b2.LINK * jnp.cos(thigh + calf)
-    depth = b2.LINK * jnp.cos(thigh) + shank_depth
-    cos, sin, zero = jnp.cos(hip), jnp.sin(hip), jnp.zeros_like(hip)
-    x, y, z = foot[:, 0], foot[:, 1], foot[:, 2]
-    return jnp.stack(
-        [
-            jnp.stack([zero, -depth, -shank_depth], axis=1),
-            jnp.stack([-z, x * sin, shank_x * sin], axis=1),
-            jnp.stack([y, -x * cos, -shank_x * cos], axis=1),
-        ],
-        axis=1,
-    )

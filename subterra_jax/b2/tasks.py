@@ -1,6 +1,7 @@
 """The tasks of the B2 by id: the walking task and the missions on a learnt gait, each as environment and params."""
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,20 +12,14 @@ from subterra_jax.b2.mission import PERIODS, Legs
 from subterra_jax.b2.model import B2
 from subterra_jax.b2.params import RandomisationParams, WalkParams
 from subterra_jax.b2.walk import WalkEnv
-from subterra_jax.constants import RANGE_MAX
-from subterra_jax.host.task_ids import B2_TRAVERSE, MISSIONS, WALK
-from subterra_jax.lidar3d.relief import Relief
-from subterra_jax.params import check_together, collect_entries, make_params
-from subterra_jax.parts import Odometer, PlanarLidar, SpatialLidar
 from subterra_jax.parts.odometer import OdometryParams
-from subterra_jax.parts.spatial_lidar import SENSORS, SpatialParams, make_sensor
 from subterra_jax.parts.unicycle import VehicleParams
-from subterra_jax.physics.stage import Stage, settle
-from subterra_jax.rules import StartParams, Traverse
-from subterra_jax.state import EnvParams, as_arrays
+from subterra_jax.physics.stage import ENGINES, Stage, settle
+from subterra_jax.rules import StartParams
+from subterra_jax.state import as_arrays
 from subterra_jax.tunnel import Tunnel
 from subterra_jax.tunnel.plan import TunnelPlan
-from subterra_jax.tunnel.sources import load_tunnel, resolve
+from subterra_jax.tunnel.sources import load_tunnel
 from subterra_jax.tunnel_env import TunnelEnv
 
 TROT = "trot"  # the scripted gait, without a trained policy
@@ -34,10 +29,14 @@ VEHICLE = VehicleParams(speed_max=0.8, yaw_rate_max=0.8, radius=0.4, period=0.2)
 # All four feet on the track, between the rails, at no larger angle than the robot reaches by itself.
 START = StartParams(station=2.0, lateral=0.3, heading=0.1)
 HORIZON = 4000
+_ENTRIES = {
+    "vehicle": VEHICLE,
+    "odometry": OdometryParams(distance_sigma=0.0, distance_bias_sigma=0.0, heading_sigma=0.0),
+    "start": START,
+}
 
 
 def make(
-    id: str = WALK,
     tunnel: TunnelPlan | str | Path | None = None,
     lining: str | None = None,
     *,
@@ -50,7 +49,6 @@ def make(
     """Makes the walking environment and its params.
 
     Args:
-        id: `Subterra/B2Walk-v1`.
         tunnel: A tunnel file, a name as for `load_tunnel`, or a plan; None is the packaged tunnel. The robot walks on
             its sleepers as measured, or on its floor where it has none.
         lining: Variant of the walls; None is `pockets`, or the first where a tunnel has none.
@@ -62,12 +60,10 @@ def make(
         **overrides: Fields of `WalkParams` to replace.
 
     Raises:
-        ValueError: No such task or field, or both a tunnel and a scene.
+        ValueError: No such field, or both a tunnel and a scene.
         TunnelError: The tunnel file is unreadable or wrong, or has no such lining.
         SubterraError: As `physics.stage.settle`.
     """
-    if id != WALK:
-        raise ValueError(f"no walking task {id!r}; there is {WALK}")
     plan = _load(tunnel, scene)
     return _walker(settle(B2, [plan], lining, scene, engine), plan, lining, overrides, driven, privileged)
 
@@ -91,85 +87,39 @@ def _load(tunnel: TunnelPlan | str | Path | None, scene: str | Path | None) -> T
     return tunnel if isinstance(tunnel, TunnelPlan) else load_tunnel(tunnel)
 
 
-def make_mission(
-    id: str = B2_TRAVERSE,
-    tunnel: TunnelPlan | str | Path | None = None,
-    lining: str | None = None,
-    *,
-    scene: str | Path | None = None,
-    policy: WalkPolicy | str | Path = RELEASED,
-    engine: Literal["mjx", "mujoco"] = "mjx",
-    relief: Relief | None = None,
-    walk: dict[str, Any] | None = None,
-    sensor: Any = SENSORS[0],
-    sweep: bool = False,
-    **overrides: Any,
-) -> tuple[TunnelEnv, EnvParams]:
-    """Makes a planar task on the legs of the B2, and its params.
+def on_legs(
+    env: TunnelEnv, tunnel: Any, lining: str | None, overrides: Mapping[str, Any]
+) -> tuple[TunnelEnv, dict[str, Any]]:
+    """Return a planar task on the legs of the B2, and its entries of `EnvParams`.
 
     Args:
-        id: One of `MISSIONS`.
+        env: The task on wheels.
         tunnel: As for `make`.
         lining: As for `make`.
-        scene: A built scene folder, instead of `tunnel`. The robot walks on its sleepers where they lie, and with
-            `engine="mujoco"` in `scene.xml` itself; the LiDAR sees all of its triangles.
-        policy: The gait: a policy, its file or name, or `trot`.
-        engine: `mjx`, for thousands on a GPU; or `mujoco`, in C on the host, for a few.
-        relief: Surface that the LiDAR sees; that of the scene, if any, if left out.
-        walk: Fields of `WalkParams` to replace.
-        sensor: The LiDAR on the trunk, as for `subterra_jax.make`.
-        sweep: As for `subterra_jax.make`; refused, since the trunk's pose within a step is not kept.
-        **overrides: Fields of `EnvParams` to replace.
+        overrides: Entries in place of the defaults; `engine` and `scene`, as for `physics.rolling.on_rover`; `policy`,
+            the gait: a policy, its file or name, or `trot`; and `walk`, fields of `WalkParams` to replace.
 
     Raises:
-        ValueError: No such task, engine or field.
-        TunnelError: The tunnel file is unreadable or wrong, or has no such lining.
+        ValueError: No such engine or field, or a LiDAR that sweeps.
         SubterraError: As `physics.stage.settle`.
         PolicyError: There is no such gait, or it does not fit the robot.
     """
-    if id not in MISSIONS:
-        raise ValueError(f"no task {id!r}; there are {', '.join(MISSIONS)}")
-    plan = _load(tunnel, scene)
+    asked = dict(overrides)
+    engine, scene = asked.pop("engine", ENGINES[0]), asked.pop("scene", None)
+    policy, fields = asked.pop("policy", RELEASED), asked.pop("walk", {})
+    if getattr(asked.get("lidar"), "sweep", False):
+        raise ValueError("sweep=True does not go with a robot on legs: it knows its trunk at the end of a step alone")
+    plan = _load(tunnel, None)
     stage = settle(B2, [plan], lining, scene, engine)
     # No pushes on the way.
-    own_walk = {"randomisation": RandomisationParams(push=0.0), **(walk or {})}
+    own_walk = {"randomisation": RandomisationParams(push=0.0), **fields}
     walker, walking = _walker(stage, plan, lining, own_walk, driven=True)
-    spatial = not (isinstance(sensor, str) and sensor == SENSORS[0])
-    if spatial:
-        made = sensor if isinstance(sensor, SpatialParams) else make_sensor(sensor)
-        sweep |= overrides.setdefault("lidar", made).sweep
-    if sweep:
-        raise ValueError("sweep=True does not go with a robot on legs: it knows its trunk at the end of a step alone")
-    if spatial:
-        source = tunnel if scene is None else Path(scene) / "tunnel.npz"
-        walking = dataclasses.replace(walking, tunnel=resolve(source, lining, None, RANGE_MAX, spatial=True))
-    trained = _gait(policy, walker.observation_size(walking))
-    own = {"walk": walking, "track": walking.track, "policy": trained, "relief": relief or stage.relief}
-    legs = Legs(walk=walker)
-    lidar = legs.carried(SpatialLidar() if spatial else PlanarLidar())
-    env = TunnelEnv(id=id, rule=Traverse(), parts=(Odometer(), lidar), motion=legs)
-    fields: dict[str, Any] = {
-        "vehicle": VEHICLE,
-        "odometry": OdometryParams(distance_sigma=0.0, distance_bias_sigma=0.0, heading_sigma=0.0),
-        "start": START,
-    }
-    if given := set(own) & set(overrides):
-        raise ValueError(
-            f"{env.id} has no {sorted(given)} to replace; `tunnel=`, `walk=`, `policy=` and `relief=` make them"
-        )
-    horizon = overrides.pop("horizon", HORIZON)
-    entries = stage.with_start(collect_entries(env, {**fields, **own, **overrides}), "start" in overrides)
-    params = make_params(env, walking.tunnel, horizon, entries)
-    check_together(env, params)
-    _check_period(params, PERIODS * walker.physics.period)
-    return env, params
-
-
-def _check_period(params: EnvParams, commanded: float) -> None:
-    """Refuse a control period other than that of the commands, s."""
-    period = float(jnp.asarray(params.vehicle.period))
+    own = {"walk": walking, "policy": _gait(policy, walker.observation_size(walking))}
+    env, entries = stage.mount(env, Legs(walk=walker), {**_ENTRIES, **asked, **own}, "start" in asked)
+    period, commanded = float(jnp.asarray(entries["vehicle"].period)), PERIODS * walker.physics.period
     if abs(period - commanded) > 1e-6:
         raise ValueError(f"the B2 takes a command every {commanded:g} s, got period={period:g}")
+    return env, entries
 
 
 def _gait(policy: WalkPolicy | str | Path, size: int) -> WalkPolicy | None:

@@ -11,7 +11,6 @@ from jax import lax
 from jaxtyping import Array
 
 from subterra_jax.host import rover
-from subterra_jax.params import collect_entries
 from subterra_jax.parts import Drive, Moved
 from subterra_jax.physics.engine import TIMESTEP, Body, Engine, Machine, set_options
 from subterra_jax.physics.riding import Physical, Ride, advance_period, has_tipped, place_on
@@ -104,10 +103,7 @@ def on_rover(
     engine, scene = asked.pop("engine", ENGINES[0]), asked.pop("scene", None)
     plans = [_plan(source, piece) for source in ([tunnel] if isinstance(tunnel, Tunnel) else list_sources(tunnel))]
     stage = settle(ROVER, plans, lining, scene, engine)
-    motion = Rover(engine=stage.engine)
-    env = dataclasses.replace(env, motion=motion, parts=tuple(motion.carried(part) for part in env.parts))
-    entries = collect_entries(env, {**asked, "track": stage.track, "relief": stage.relief})
-    return env, stage.with_start(entries, "start" in overrides and not hidden_start)
+    return stage.mount(env, Rover(engine=stage.engine), asked, "start" in overrides and not hidden_start)
 
 
 def _plan(source: Source, piece: tuple[float, float] | None) -> TunnelPlan:

@@ -15,9 +15,12 @@ from jaxtyping import Float
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.host.rover import GROUND, LOW_WALL, RAIL, ROLL
 from subterra_jax.lidar3d.relief import Relief
+from subterra_jax.params import collect_entries
 from subterra_jax.physics.engine import Engine, Machine, MujocoEngine
 from subterra_jax.physics.ground import RAIL_HALF, RAIL_OFFSET, SLEEPER_HALF, Track, TrackError, join_tracks, read_track
+from subterra_jax.physics.riding import Physical
 from subterra_jax.tunnel.plan import TunnelPlan
+from subterra_jax.tunnel_env import TunnelEnv
 
 ENGINES = ("mjx", "mujoco")
 _MARGIN = 0.1  # to either side of a robot, m
@@ -49,26 +52,33 @@ class Stage:
     relief: Relief | None
     room: float
 
-    def with_start(self, entries: Mapping[str, Any], given: bool) -> dict[str, Any]:
-        """Return entries whose start leaves room beside the robot.
+    def mount(
+        self, env: TunnelEnv, motion: Physical, entries: Mapping[str, Any], given: bool
+    ) -> tuple[TunnelEnv, dict[str, Any]]:
+        """Return a task on a robot here, which carries its LiDAR, and its entries of `EnvParams`.
 
         Args:
-            given: The start is the user's own.
+            env: The task on wheels.
+            motion: What moves the robot.
+            entries: Entries in place of the defaults.
+            given: The start among them is the user's own. Another is changed to leave room beside the robot.
 
         Raises:
-            ValueError: It is, and does not.
+            ValueError: There is no such entry, or the user's start leaves no room.
         """
-        start = entries["start"]
+        env = dataclasses.replace(env, motion=motion, parts=tuple(motion.carried(part) for part in env.parts))
+        found = collect_entries(env, {"relief": self.relief, **entries, "track": self.track})
+        start = found["start"]
         lateral = float(np.max(np.asarray(start.lateral)))
         if not given:
             near = {"station": max(start.station, _FROM_MOUTH), "lateral": min(lateral, self.room, _ON_TRACK)}
-            return {**entries, "start": dataclasses.replace(start, **near)}
+            return env, {**found, "start": dataclasses.replace(start, **near)}
         if lateral > self.room + 1e-6:
             raise ValueError(
                 f"start.lateral = {lateral:g} m may put the {self.engine.machine.name} into a wall or onto a rail; "
                 f"{self.room:.2f} m are free"
             )
-        return dict(entries)
+        return env, found
 
 
 def settle(

@@ -18,7 +18,6 @@ import subterra_jax as st
 from benchmarks import b2_traverse
 from benchmarks.records import read_records
 from subterra_jax.b2 import gait as gaits
-from subterra_jax.b2 import tasks
 from subterra_jax.b2.transfer import LaggedWheels
 from subterra_jax.host.errors import OutputError
 from subterra_jax.policies.files import PolicyError
@@ -96,7 +95,7 @@ def world():
 
 
 def test_the_stand_in_is_told_what_the_legs_are_told_and_obeys_as_late(world):
-    mission, params = tasks.make_mission(policy="trot")
+    mission, params = st.make("Subterra/B2Traverse-v1", policy="trot")
     assert world.env.motion == LaggedWheels()
     assert world.facts["motion"] == "b2"
     bounds, legs = world.env.action_space(world.params), mission.action_space(params)
