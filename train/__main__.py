@@ -17,6 +17,7 @@ import tyro
 from subterra_jax.host.command import EXIT_INTERRUPTED, parse, run_command
 from train import clock
 from train.config import ConfigError, TrainConfig, check, make_config
+from train.devices import with_seed
 from train.evaluate import check_episodes
 from train.options import insert_file, reward_of, settings_of, with_weights
 from train.session import Session, check_seeds, run_seeds
@@ -154,10 +155,10 @@ def _several(arguments: Command, world: World) -> int:
     sessions = []
     if arguments.config.parts > 1:
         raise ConfigError(f"parts = {arguments.config.parts} cannot be trained for several seeds at once")
+    first = make_learner(world, arguments.config)
     for seed in arguments.seeds:
-        config = dataclasses.replace(arguments.config, seed=seed)
-        learner, out = make_learner(world, config), arguments.out / f"seed-{seed}"
-        alone = settings_of(dataclasses.replace(arguments, config=config))
+        learner, out = with_seed(first, seed), arguments.out / f"seed-{seed}"
+        alone = settings_of(dataclasses.replace(arguments, config=learner.config))
         sessions.append(Session(out, world, learner, logs=arguments.logs, command=alone))
     return run_seeds(
         arguments.out,

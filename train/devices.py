@@ -1,5 +1,6 @@
 """One run on many devices: parts of its environments, and compiler options."""
 
+import copy
 import dataclasses
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -24,7 +25,7 @@ def compiler_options(config: TrainConfig) -> dict[str, str | bool] | None:
     return {"xla_gpu_deterministic_ops": True} if needed else None
 
 
-T = TypeVar("T")
+T, L = TypeVar("T"), TypeVar("L")
 Parts = tuple[str, ...]
 
 
@@ -42,6 +43,13 @@ class Whole:
     def gather(self, state: T) -> T:
         """Returns the state, unchanged."""
         return state
+
+
+def with_seed(learner: L, seed: int) -> L:
+    """Returns a learner that differs by its seed alone: tables of the map are made once for all seeds."""
+    other: Any = copy.copy(learner)
+    other.config = dataclasses.replace(other.config, seed=seed)
+    return other
 
 
 def mean_over_parts(tree: T, parts: Parts) -> T:
