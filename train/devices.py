@@ -25,7 +25,8 @@ def compiler_options(config: TrainConfig) -> dict[str, str | bool] | None:
     return {"xla_gpu_deterministic_ops": True} if needed else None
 
 
-T, L = TypeVar("T"), TypeVar("L")
+T = TypeVar("T")
+L = TypeVar("L")
 Parts = tuple[str, ...]
 
 
