@@ -292,6 +292,10 @@ def test_coordinates_rounded_to_centimetres_are_told_and_those_rounded_to_half_a
         np.savetxt(tmp_path / f"{step}.xyz", np.round(bore / step) * step, fmt="%.3f")
     assert "rounded_to" not in read_cloud(tmp_path / "0.001.xyz", 0.04)[1]
     assert read_cloud(tmp_path / "0.05.xyz", 0.04)[1]["rounded_to"] == pytest.approx(0.05, abs=1e-6)
+    rng = np.random.default_rng(3)
+    seven = [rng.permutation(np.repeat(0.05 * np.arange(200), 7)) for _ in range(3)]  # too few of each to be a grid
+    np.savetxt(tmp_path / "seven.xyz", np.column_stack(seven), fmt="%.3f")
+    assert "rounded_to" not in read_cloud(tmp_path / "seven.xyz", 0.04, ReadingConfig(unit="m"))[1]
     with pytest.raises(RecordingError, match=r"rounded to 0\.5 m"):
         read_cloud(tmp_path / "0.5.xyz", 0.04)
 

@@ -1,6 +1,7 @@
 """Furniture by standard: in its place, clear of the robot's gauge, and the same to MuJoCo's rays as in the plane."""
 
 from dataclasses import replace
+from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from scene.writing.folder import write_geometry
 from scene.writing.furnished import FurnitureConfig, TunnelSpace, count_pieces, furnish_bore, planar_segments
 from scene.writing.mesh import as_trimesh, build_solid, has_rings, open_lining, split_skin
-from scene.writing.mjcf import SceneConfig, concrete_picture
+from scene.writing.mjcf import SceneConfig, add_lights, concrete_picture
 from scene.writing.track import TrackConfig, lay_track
 from subterra_jax.host.tunnelfile import read_fields
 from tests.scene.conftest import arc_bore
@@ -191,6 +192,14 @@ def test_texture_coordinates_run_once_around_without_a_jump_inside_a_face(bore, 
     texture_at, corner = split_skin(lining, bore, laid.bed)["lining"][1]
     assert np.ptp(texture_at[corner], axis=1).max() < 0.3
     assert np.ptp(texture_at[corner][..., 0]) == pytest.approx(1.0, abs=0.05)
+    texture_at, corner = split_skin(lining, replace(bore, ring_station=np.empty(0)), laid.bed)["lining"][1]
+    assert np.ptp(texture_at[corner][..., 1]) == pytest.approx(bore.length / 3.0, rel=0.02)  # two bays of 1.5 m
+
+
+def test_the_first_seven_lamps_are_on(bore):
+    world = ElementTree.Element("worldbody")
+    assert add_lights(world, bore, spacing=2.0) == 12
+    assert [light.get("active") for light in world] == ["true"] * 7 + ["false"] * 5
 
 
 def test_stations_of_surveyed_rings_are_no_joints(bore):

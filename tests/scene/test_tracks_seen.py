@@ -146,6 +146,9 @@ def test_rails_on_a_bare_floor_get_no_sleepers_and_the_robot_drives_on_the_floor
 def test_the_user_may_want_none_or_the_standard_and_rings_show_none():
     _, bore = scanned("proud")
     seen = seen_in("proud")
+    (line,) = seen.lines
+    sunk = replace(line, rails=replace(line.rails, top=line.sleepers.protrusion + 0.05))
+    assert lay_track(bore, TrackConfig(), SeenTrack((sunk,), True)).lines[0].rail_height == 0.08
     for config, shown, why in (
         (TrackConfig(lay="none"), seen, "none: as asked for"),
         (TrackConfig(), SeenTrack(), "none: the survey can show no rails"),

@@ -83,6 +83,7 @@ def test_who_gets_the_beams_in_the_wrong_order_cannot_traverse():
     assert evaluate(env, params, panel(agents, order=order), episodes).success.mean() < 0.2
 
 
+@pytest.mark.timeout(900)
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(set(names()) - {"oracle"}))
 def test_on_the_control_tunnel_nobody_beats_fused_dead_reckoning_by_three_points(name):

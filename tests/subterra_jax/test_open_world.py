@@ -177,6 +177,13 @@ def test_walls_have_the_steps_and_roughness_of_their_kind(drawn):
     assert not any(isinstance(layer, Rings) for layer in drawn["sprayed"].bore.layers)
 
 
+def test_a_round_of_blasting_widens_from_its_joint_to_the_next():
+    rounds = Stretches(np.array([2.0, 5.0]), np.zeros(3), np.zeros((3, 2)), 0.2)
+    grid = Grid(np.array([0.0, 1.0, 2.0, 2.001, 3.5, 5.0, 6.0]), *np.zeros((3, 1)))
+    along = rounds.relief(grid, np.array([0]))[:, 0]
+    np.testing.assert_allclose(along, [-0.1, 0.0, 0.1, -0.1, 0.0, 0.1, 0.1], atol=2e-4)
+
+
 def test_a_masonry_tunnel_has_refuges_every_20_to_30_m_on_either_side(drawn):
     niche = drawn["masonry"].bore.niche
     for side in (1.0, -1.0):

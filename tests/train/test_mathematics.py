@@ -13,7 +13,7 @@ import pytest
 
 from tests.train.conftest import TASK, call
 from train import __main__ as navigate
-from train import devices, learning, localiser
+from train import devices, drives, learning, localiser, map_target
 from train.config import TrainConfig
 
 
@@ -119,6 +119,27 @@ def test_the_localiser_learns_ever_more_slowly_down_to_a_fiftieth(monkeypatch):
     learn = jax.jit(lambda iteration: learner.learn(before, None, params, jax.random.PRNGKey(1), iteration)[0])
     moved = [bias(before) - bias(learn(iteration)) for iteration in (0, 5, 10)]
     np.testing.assert_allclose(moved, config.localiser_rate * np.array([1.0, 0.51, 0.02]), rtol=1e-2)
+
+
+def test_a_wrong_map_is_of_a_place_at_least_50_m_away():
+    tunnel = SimpleNamespace(count=1, length=jnp.float32(300.0))
+    drive = SimpleNamespace(start=jnp.linspace(0.0, 250.0, 4000), tunnel=jnp.zeros(4000, jnp.int32))
+    given = map_target.draw_cases(jax.random.key(0), drive, SimpleNamespace(tunnel=tunnel))
+    wrong, away = ~np.asarray(given.right), np.abs(np.asarray(given.shift))
+    assert np.mean(wrong) == pytest.approx(0.2, abs=0.02)
+    assert np.mean(np.asarray(given.sigma) > 0.0) == pytest.approx(0.5, abs=0.03)
+    assert np.minimum(away, 300.0 - away)[wrong].min() > 49.99
+    assert (away[~wrong] == 0.0).all()
+
+
+def test_drives_begin_where_there_is_room_for_all_their_way(monkeypatch):
+    monkeypatch.setattr(drives, "_starts", lambda env, params, keys, n, room: pytest.fail(f"{room:.0f}"))
+    vehicle = SimpleNamespace(period=0.1, speed_max=2.0)
+    with pytest.raises(pytest.fail.Exception) as asked:
+        drives.record_drives(
+            SimpleNamespace(env=None), None, SimpleNamespace(vehicle=vehicle), jax.random.PRNGKey(0), 4, 100
+        )
+    assert float(str(asked.value)) > 20.0 + 20.0  # at full speed, and on to the goal's far side
 
 
 TWO_DEVICES = """

@@ -11,7 +11,7 @@ import subterra_jax as st
 from tests.subterra_jax.tunnels import write_corridor
 from tests.train.conftest import SMALL, TASK, call, log_without_timing
 from train import __main__ as navigate
-from train import ppo, session
+from train import learning, ppo, session
 from train.config import ConfigError, TrainConfig
 from train.driver import Driver, Policy, Seen
 from train.learner import Learner
@@ -103,6 +103,36 @@ def test_the_value_target_of_a_truncated_step_goes_on_with_its_final_observation
     assert cut.sum() == N_ENVS
     assert np.abs(np.asarray(rollout.final_value)[cut]).min() > 1e-3
     np.testing.assert_allclose(np.asarray(batch.target)[cut], expected[cut], atol=1e-5)
+
+
+def test_the_loss_is_the_weighted_sum_of_its_parts(driven, monkeypatch):
+    learner = Learner(driven["env"], driven["driver"], CONFIG)
+    rollout = dataclasses.replace(driven["rollout"], error=np.ones((N_STEPS, N_ENVS, 1), np.float32))
+    batch = learner._batch(driven["policy"], driven["middle"], rollout, driven["after"], np.float32(2.0))
+    monkeypatch.setattr(learning, "auxiliary_loss", lambda estimate, error: 7.0)
+    total, parts = learner._loss(driven["policy"].network, batch)
+    expected = parts["policy_loss"] + CONFIG.value_weight * parts["value_loss"] + 7.0 * CONFIG.auxiliary_weight
+    assert float(total) == pytest.approx(float(expected - CONFIG.entropy_weight * parts["entropy"]), rel=1e-5)
+
+
+class Filling(Driver):
+    """Keeps statistics of its inputs, as that of the walking robot does."""
+
+    def start_statistics(self):
+        return learning.start_statistics((self.layout.shape.n_inputs,))
+
+
+def test_the_first_iteration_fills_the_statistics_and_only_the_second_learns(driven):
+    driver = Filling(driven["env"], driven["driver"].layout)
+    learner = Learner(driven["env"], driver, dataclasses.replace(CONFIG, steps=10 * N_ENVS * N_STEPS))
+    states = [learner.init(jax.random.key(0), driven["params"])]
+    iterate = jax.jit(learner.iterate)
+    for _ in range(2):
+        states.append(iterate(states[-1], driven["params"])[0])
+    weights = [state.student.weights for state in states]
+    same = [jax.tree.leaves(jax.tree.map(np.array_equal, weights[0], later)) for later in weights[1:]]
+    assert all(same[0])
+    assert not all(same[1])
 
 
 def test_a_robot_is_told_the_length_of_its_own_tunnel_of_a_stack(tmp_path):
