@@ -101,7 +101,7 @@ def _open(arguments: Command) -> tuple[Any, Any]:
         options |= {"scene": arguments.scene, "engine": arguments.engine}
     if arguments.robot == "b2":
         return st.make(B2_TRAVERSE, policy=arguments.policy, **options)
-    id = full_id(arguments.task.removeprefix("Subterra/").removesuffix("-v1"))
+    id = full_id(arguments.task.removeprefix("Subterra/"))
     if id == "Subterra/Traverse-v1":
         options["horizon"] = _HORIZON
     return st.make(id, motion=arguments.robot, **options)

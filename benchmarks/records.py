@@ -7,8 +7,9 @@ figures of such files differ from those on record.
 
 A record is one figure. Commands write theirs to `records.json` beside their other results. A page
 holds a table's template in a comment, with ids in braces, and the rendered table behind it. A line
-`{board: SPLIT}` is the board's tables by kind, `{board: screen}` its table of all tasks; `{rows: FAMILY; COLUMN COLUMN;
-LABEL = ROW; ROW}` a line for each row, of the records `FAMILY/ROW/COLUMN`, with a dash where one was not measured.
+`{board: SPLIT}` is the board's tables by kind, `{board: screen}` its table of all tasks, `{board:
+given}` without those of a hidden start; `{rows: FAMILY; COLUMN COLUMN; LABEL = ROW; ROW}` a line
+for each row, of the records `FAMILY/ROW/COLUMN`, with a dash where one was not measured.
 """
 
 import dataclasses
@@ -219,6 +220,8 @@ def board(split: str) -> str:
     from benchmarks.board.tables import kinds_markdown, screen_markdown
 
     cells = read_cells(FOLDER.parent / "board" / "cells.jsonl")
+    if split == "given":
+        return screen_markdown([cell for cell in cells if not cell["hidden_start"]])
     return screen_markdown(cells) if split == "screen" else kinds_markdown(cells, split)
 
 

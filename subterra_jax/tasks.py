@@ -99,9 +99,10 @@ def register(
     id: str,
     rule: Rule,
     *,
-    horizon: int,
+    like: str | None = None,
+    horizon: int | None = None,
     piece: tuple[float, float] | None = None,
-    parts: Sequence[Part] = PLAIN,
+    parts: Sequence[Part] | None = None,
     params: Mapping[str, Any] | None = None,
     tunnel: str | None = None,
 ) -> None:
@@ -110,14 +111,16 @@ def register(
     Args:
         id: Gymnasium id, `Namespace/Name-v1`.
         rule: Rule of the task.
-        horizon: Steps after which an episode is truncated.
+        like: Id of a task that has what is not given here.
+        horizon: Steps after which an episode is truncated; needed without `like`.
         piece: Start and length of the piece of tunnel that the task happens in, m; None for the whole tunnel.
-        parts: Parts in the order in which they act: `PLAIN`, `SLIPPING`, or parts of one's own.
-        params: Entries of `EnvParams` that differ from the defaults of parts and rule.
+        parts: Parts in the order in which they act: `PLAIN` (the default), `SLIPPING`, or parts of one's own.
+        params: Entries of `EnvParams` that differ from the defaults of parts and rule, or from those of `like`.
         tunnel: Tunnel where none is named, as `subterra-351`; None for some of the open world.
 
     Raises:
-        ValueError: The id belongs to the benchmark, has another form, or the rule's goal kind is unknown.
+        ValueError: The id belongs to the benchmark or has another form, the rule's goal kind is unknown, or the horizon
+            is missing.
     """
     if id in BENCHMARK:
         raise ValueError(f"{id} is a task of the benchmark; register yours under another id")
@@ -130,7 +133,12 @@ def register(
         raise ValueError(
             f"{id}: goal_kind must be one of {', '.join(GOAL_KINDS)}, {type(rule).__name__} has {rule.goal_kind!r}"
         )
-    TASKS[id] = Task(rule, horizon, piece, tuple(parts), dict(params or {}), tunnel)
+    if horizon is None and like is None:
+        raise ValueError(f"{id}: say horizon=STEPS, or like=ID of a task that has one")
+    base = Task(rule, 0) if like is None else TASKS[find(like)]
+    named = {"horizon": horizon, "piece": piece, "parts": None if parts is None else tuple(parts), "tunnel": tunnel}
+    given: dict[str, Any] = {name: value for name, value in named.items() if value is not None}
+    TASKS[id] = dataclasses.replace(base, rule=rule, params={**base.params, **(params or {})}, **given)
     if importlib.util.find_spec("gymnasium") is not None:
         register_tasks((id,))
 
@@ -198,8 +206,8 @@ def make(
         split: In place of `tunnel`, those of another split of the open world: `train`, `val`, `test-seen` or
             `test-unseen`.
         motion: `wheels`, a unicycle that does what it is given; or `rover`, a Scout 2.0 with mass by physics in MJX,
-            with the same observations, rewards and ends. Then `engine="mujoco"` computes it in MuJoCo's own C, and
-            `scene=` names the folder of a built scene to do that in.
+            with the same observations, rewards and ends. Then `engine="mujoco"` computes it in MuJoCo's own C; `scene=`
+            in place of `tunnel` names the folder of a built scene to do that in.
         **overrides: Entries of `EnvParams` to replace: `horizon=100`, `lidar=LidarParams(range_sigma=0.0)`. `slip`,
             `obstacles`, `faults` and `imu` bring their part to a task that lacks it.
 
@@ -215,11 +223,19 @@ def make(
     keep_programs()
     id = find(id)
     if motion not in MOTIONS or (motion != MOTIONS[0] and id not in TASKS):
+<<<<<<< HEAD
         raise ValueError(f"{id} has no motion {motion!r}; it has {', '.join(MOTIONS) if id in TASKS else 'legs'}")
     if (motion == ROVER or id in MISSIONS) and overrides.get("scene") is not None:
+=======
+        has = f"{', '.join(MOTIONS)}; a B2 drives {MISSIONS[0]}" if id in TASKS else "legs, and needs no word for it"
+        raise ValueError(f"{id} has no motion {motion!r}; it has {has}")
+    if id in TASKS and (scene := overrides.get("scene")) is not None:
+>>>>>>> 13acc545 (A scene folder is a tunnel wherever one is named; a task registers like another; README shows released policies and what the floor is)
         if tunnel is not None:
-            raise ValueError(f"either a tunnel or a scene, got both {str(tunnel)!r} and {str(overrides['scene'])!r}")
-        tunnel = Path(overrides["scene"]) / "tunnel.npz"
+            raise ValueError(f"either a tunnel or a scene, got both {str(tunnel)!r} and {str(scene)!r}")
+        tunnel = scene
+    if motion != ROVER and id in TASKS:
+        overrides.pop("scene", None)
     if id in TASKS:
         tunnel = tunnel_for(id, tunnel, split, spatial=not is_planar(sensor))
     if hidden_start:

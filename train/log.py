@@ -156,5 +156,5 @@ def print_table(title: str, values: dict[str, Any]) -> None:
     console, grid = Console(), Table(show_header=False)
     for name, value in values.items():
         grid.add_row(name, f"{value:.4g}" if isinstance(value, float) else str(value))
-    console.print(title, highlight=False)
+    console.print(title, highlight=False, emoji=False)  # `:train:` of a tunnel's name is a tram
     console.print(grid)

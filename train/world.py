@@ -94,7 +94,7 @@ def require_task(task: str) -> str:
         ConfigError: There is no such task, or this command does not learn it.
     """
     try:
-        task = find(f"Subterra/{task}" if f"Subterra/{task}" in st.TASKS else task)
+        task = find(task, short=True)
     except TaskError as error:
         raise ConfigError(str(error)) from error
     if task not in st.TASKS:

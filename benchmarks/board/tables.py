@@ -29,7 +29,7 @@ CHOICE = "val"  # where the best of a group is chosen
 HEADINGS = ("floor", "best written", "learnt", "learnt by reward alone", "with map", "ceiling")
 GROUPS: dict[str, tuple[Group, ...]] = {
     "best written": ("blind", "written"),
-    "learnt": ("learnt", "reward"),
+    "learnt": ("learnt",),
     "learnt by reward alone": ("reward",),
     "with map": ("map",),
 }

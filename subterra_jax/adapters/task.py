@@ -122,9 +122,11 @@ def open_task(task: str, flat: bool, render_mode: str | None, view: str, options
     check_mode(render_mode)
     refuse_fork()
     tunnel, lining, split = (options.pop(name, None) for name in ("tunnel", "lining", "split"))
-    drawn, tunnel = view_for(
-        view, task, tunnel, split, lining, options.get("sensor", SENSORS[0]), options.get("texture", 0.0)
+    scene = options.get("scene")  # which takes the place of a tunnel, in the picture too
+    drawn, found = view_for(
+        view, task, scene or tunnel, split, lining, options.get("sensor", SENSORS[0]), options.get("texture", 0.0)
     )
+    tunnel = tunnel if scene else found
     return Task(*make(task, tunnel, lining, **options), flat), drawn
 
 

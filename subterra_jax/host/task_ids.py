@@ -13,8 +13,8 @@ BENCHMARK = (*PLANAR, WALK, *MISSIONS)
 
 
 def full_id(name: str) -> str:
-    """Return `Subterra/StopAt-v1` for `StopAt`; any other name unchanged."""
-    full = f"Subterra/{name}-v1"
+    """Return `Subterra/StopAt-v1` for `StopAt` and `StopAt-v1`; any other name unchanged."""
+    full = f"Subterra/{name.removesuffix('-v1')}-v1"
     return full if full in BENCHMARK else name
 
 

@@ -20,7 +20,7 @@ from subterra_jax.tunnel.shell import N_BRICK, SPACING, Shell, ShellLining
 def describe_damage(path: Path, error: Exception) -> str:
     """Say why an archive cannot be read; NumPy's own message takes every other file for a pickle."""
     if path.is_dir():
-        return "it is a folder"
+        return "it is a folder without a tunnel.npz"
     return str(error) if path.stat().st_size and zipfile.is_zipfile(path) else "it is no zip file, or is cut short"
 
 

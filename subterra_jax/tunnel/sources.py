@@ -40,17 +40,21 @@ Source = Tunnel | TunnelPlan | str | Path | None
 
 
 def tunnel_file(path: str | Path | None) -> Traversable:
-    """Return the file for a path, for the name of a packaged tunnel, or for `None`, the default one."""
+    """Return the file for a path, which may be a scene's folder, for a packaged tunnel's name, or for `None`."""
     name = PACKAGED[0] if path is None else str(path)
-    return resources.files("subterra_jax") / "data" / f"{name}.npz" if name in PACKAGED else Path(name)
+    if name in PACKAGED:
+        return resources.files("subterra_jax") / "data" / f"{name}.npz"
+    inside = Path(name) / "tunnel.npz"
+    return inside if inside.is_file() else Path(name)
 
 
 def load_tunnel(path: str | Path | None = None, *, solid: bool = False) -> TunnelPlan:
     """Read and check a `tunnel.npz`, or generate a tunnel by its name.
 
     Args:
-        path: The file; the name of a packaged tunnel (`subterra-351`, `metro`); `control`, the bore without
-            landmarks; `open:SPLIT:INDEX` or `open:KIND:SPLIT:INDEX` of the open world. `None`: the first packaged.
+        path: The file, or the scene folder that holds it; the name of a packaged tunnel (`subterra-351`, `metro`);
+            `control`, the bore without landmarks; `open:SPLIT:INDEX` or `open:KIND:SPLIT:INDEX` of the open world.
+            `None`: the first packaged.
         solid: Give a tunnel of the open world its shell too, the bore in three dimensions; a file that has one always
             comes with it.
 

@@ -49,6 +49,17 @@ def test_both_checkers_have_nothing_to_say(task, made):
     assert [text for text in said if not any(advice in text for advice in ADVICE)] == []
 
 
+def test_a_scene_folder_is_a_tunnel_wherever_one_is_named(tmp_path):
+    from tests.subterra_jax.tunnels import straight, tunnel_arrays, write_tunnel
+
+    write_tunnel(tmp_path / "tunnel.npz", tunnel_arrays(straight(40.0)))
+    for named in ({"tunnel": str(tmp_path)}, {"scene": tmp_path}):
+        assert SubterraEnv(TASK, **named).task_params.tunnel.length == 40.0
+        assert st.make(TASK, **named)[1].tunnel.length == 40.0
+    with pytest.raises(ValueError, match="either a tunnel or a scene, got both 'metro'"):
+        SubterraEnv(TASK, tunnel="metro", scene=tmp_path)
+
+
 def test_gymnasium_finds_a_task_by_module_and_id_alone_and_nothing_heavy_comes_with_it():
     # Not rich, which flax brings along.
     heavy = ("mujoco", "brax", "gymnax", "stable_baselines3", "torch", "tyro", "scene", "train", "benchmarks")
