@@ -223,14 +223,9 @@ def make(
     keep_programs()
     id = find(id)
     if motion not in MOTIONS or (motion != MOTIONS[0] and id not in TASKS):
-<<<<<<< HEAD
-        raise ValueError(f"{id} has no motion {motion!r}; it has {', '.join(MOTIONS) if id in TASKS else 'legs'}")
-    if (motion == ROVER or id in MISSIONS) and overrides.get("scene") is not None:
-=======
         has = f"{', '.join(MOTIONS)}; a B2 drives {MISSIONS[0]}" if id in TASKS else "legs, and needs no word for it"
         raise ValueError(f"{id} has no motion {motion!r}; it has {has}")
-    if id in TASKS and (scene := overrides.get("scene")) is not None:
->>>>>>> 13acc545 (A scene folder is a tunnel wherever one is named; a task registers like another; README shows released policies and what the floor is)
+    if id != WALK and (scene := overrides.get("scene")) is not None:
         if tunnel is not None:
             raise ValueError(f"either a tunnel or a scene, got both {str(tunnel)!r} and {str(scene)!r}")
         tunnel = scene

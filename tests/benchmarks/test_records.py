@@ -89,7 +89,7 @@ def test_a_number_is_shown_with_the_digits_that_it_has(value, text):
 def test_every_record_has_a_command_that_its_module_understands(command_line):  # noqa: F811
     commands = {one.command for one in records.on_record().values() if not one.commit.startswith("until ")}
     for command in sorted(
-        {part for one in commands for part in re.split("; (?=benchmarks)", one)}
+        {part for one in commands for part in re.split("; (?=benchmarks|train)", one)}
     ):  # trained, then driven
         if command.split()[0] not in ("timeit", "pytest"):
             assert importlib.util.find_spec(command.split()[0]), command
