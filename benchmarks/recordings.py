@@ -191,8 +191,8 @@ def read_case(drive: Drive, case: Case, path: Path) -> Row:
                 late = replace(drive.poses, times=drive.poses.times + case.late)
                 lag = settle(recording, late, True)[0].offset
             else:
-                inertial, _ = find_inertial(recording, load_calibration(drive.mounts))
-                lag = settle(recording, inertial, True)[0].offset if inertial else None
+                inertial, mount = find_inertial(recording, load_calibration(drive.mounts))
+                lag = settle(recording, inertial, True, mount.rotation)[0].offset if inertial and mount else None
             times = recording.convention
             error = time_error(drive, case, recording, case.late - (lag or 0.0))
             said = recording.facts["point_times"]

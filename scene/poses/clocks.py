@@ -27,9 +27,11 @@ _PASSES = 3  # times that they are matched: each unwinds sweeps by the motion th
 _POINTS = 6_000  # of a sweep
 _WARM_UP = 8  # sweeps that are left out: the map is too thin for them
 _REACH, _COARSE, _STEP = 1.5, 0.02, 0.005  # s: largest lag that is tried, and between two lags, far and near
-_AGREE = 0.8  # correlation of turn rates from which a lag counts
+_LIKELY, _AGREE = 0.5, 0.8  # correlations of turn rates from which a lag is looked at closely, and counts
+_AS_KNOWN = 0.95  # of the agreement after the best rotation, with which mounts are as they are known
 _LIVELY = 0.03  # rad/s, mean size less the mean; a carrier that turns more evenly tells no lag
 _LONGEST = 3.0  # times the median size
+_FINEST = 1e-4  # rad/s; no axis is known better
 _OVERLAP = 0.5  # of the shorter one's time
 
 Timed = TypeVar("Timed", Inertial, Trajectory)
@@ -72,11 +74,15 @@ def lidar_turns(recording: Recording) -> LidarTurns | None:
     return LidarTurns(at[:-1], at[1:], steps)
 
 
-def turns_of_gyro(inertial: Inertial) -> Turns:
-    """Return the mean turn rates of an IMU over intervals of its own clock, rad/s."""
+def turns_of_gyro(inertial: Inertial, mount: Float[np.ndarray, "3 3"] | None = None) -> Turns:
+    """Return the mean turn rates of an IMU over intervals of its own clock, rad/s.
+
+    They are about the LiDAR's axes where the rotation of its `mount` against the LiDAR is known.
+    """
+    rate = inertial.rate if mount is None else inertial.rate @ mount
 
     def rates(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-        angle = [integrals(at, inertial.times, inertial.rate) for at in (start, end)]
+        angle = [integrals(at, inertial.times, rate) for at in (start, end)]
         return (angle[1] - angle[0]) / (end - start)[:, None]
 
     return rates
@@ -105,11 +111,29 @@ def find_lag(lidar: LidarTurns, other: Turns) -> tuple[float | None, float]:
 
     near = max(np.arange(-_REACH, _REACH + _COARSE, _COARSE), key=agree)
     best = max(np.arange(near - _COARSE, near + _COARSE, _STEP), key=agree)
-    before, here, after = (agree(best + side) for side in (-_STEP, 0.0, _STEP))
-    if here < _AGREE or abs(best) >= _REACH:
+    if (here := agree(best)) < _LIKELY or abs(best) >= _REACH:
         return None, here
-    bend = before - 2.0 * here + after
-    return float(best + (0.5 * _STEP * (before - after) / bend if bend < 0 else 0.0)), here
+    # Now each axis counts by its own noise: a LiDAR that sees little of floor and crown hardly knows its pitch.
+    there = other(lidar.start + best, lidar.end + best)
+    turn = _rotation(own, _even(there))
+    off = np.linalg.norm(lidar.rate - there @ turn.T, axis=1)
+    sure = off <= _LONGEST * np.median(off)
+    start, end, rate = lidar.start[sure], lidar.end[sure], lidar.rate[sure]
+
+    def turned(lag: float) -> Float[np.ndarray, "k 3"]:
+        return other(start + lag, end + lag) @ turn.T
+
+    def noise(lag: float) -> float:
+        return float(np.log((rate - turned(lag)).var(axis=0) + _FINEST**2).sum())
+
+    best = min(np.arange(best - 2 * _COARSE, best + 2 * _COARSE, _STEP), key=noise)
+    one, two = (part - part.mean(axis=0) for part in (rate, turned(best)))
+    here = _agreement(*(part / np.hypot((one - two).std(axis=0), _FINEST) for part in (one, two)))
+    if here < _AGREE:
+        return None, here
+    before, least, after = (noise(best + side) for side in (-_STEP, 0.0, _STEP))
+    bend = before - 2.0 * least + after
+    return float(best + (0.5 * _STEP * (before - after) / bend if bend > 0 else 0.0)), here
 
 
 def _even(rate: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3"]:
@@ -117,6 +141,14 @@ def _even(rate: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3"]:
     rate = rate - np.median(rate, axis=0)
     size = np.linalg.norm(rate, axis=1, keepdims=True)
     return rate * np.minimum(1.0, _LONGEST * np.median(size) / np.maximum(size, 1e-12))
+
+
+def _rotation(one: Float[np.ndarray, "k 3"], other: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "3 3"]:
+    """Return the rotation of `other` that suits one best: none where that does nearly as well, as for known mounts."""
+    if float(np.sum(one * other)) > _AS_KNOWN * _agreement(one, other) * np.linalg.norm(one) * np.linalg.norm(other):
+        return np.eye(3)
+    left, _, right = np.linalg.svd(one.T @ other)
+    return left @ np.diag([1.0, 1.0, np.linalg.det(left) * np.linalg.det(right)]) @ right
 
 
 def _agreement(one: Float[np.ndarray, "k 3"], other: Float[np.ndarray, "k 3"]) -> float:
@@ -155,13 +187,16 @@ class Clock:
         )
 
 
-def settle(recording: Recording, other: Timed, auto: bool) -> tuple[Clock, Timed]:
+def settle(
+    recording: Recording, other: Timed, auto: bool, mount: Float[np.ndarray, "3 3"] | None = None
+) -> tuple[Clock, Timed]:
     """Return what the turns of sweeps and of another instrument tell of their clocks, and it by the LiDAR's clock.
 
-    Raises `RecordingError` where the two share no time, and not `auto`.
+    `mount` is the rotation of an IMU against the LiDAR. Raises `RecordingError` where the two share no time, and not
+    `auto`.
     """
     if isinstance(other, Inertial):
-        of, turns = f"the IMU {other.topic}", turns_of_gyro(other)
+        of, turns = f"the IMU {other.topic}", turns_of_gyro(other, mount)
     else:
         of, turns = f"the trajectory {other.path.name}", turns_of_poses(other)
     apart = find_gap(recording, of, other.times, auto)

@@ -55,9 +55,9 @@ def _find_timed(
 ) -> tuple[Inertial | None, Mount | None, Clock | None]:
     """Return the IMU with its mount, by the LiDAR's clock where `auto`, and what is known of its clock."""
     inertial, mount = find_inertial(recording, calibration)
-    if inertial is None:
+    if inertial is None or mount is None:
         return None, None, None
-    clock, timed = settle(recording, inertial, auto)
+    clock, timed = settle(recording, inertial, auto, mount.rotation)
     return timed if clock.corrected else inertial, mount, clock
 
 
