@@ -87,7 +87,7 @@ def small(topics: tuple[str, ...], **times: float) -> Write:
 
 
 CONTROL = "--control {0}/prism.tum --calibration {0}/vlp16.yaml"
-OTHER = "by another clock, {}; sweeps of 0.05"
+OTHER = "by another clock, {}; sweeps of 0."
 ROWS = {
     "ns since boot in floats": Row(boot("ns", 320.0), OTHER.format("ns"), facts=SOUND),
     "s since boot": Row(boot("s", 320.0), OTHER.format("s"), facts=SOUND | {"quaternions": "xyzw (by default)"}),
