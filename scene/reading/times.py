@@ -179,7 +179,7 @@ def join_scans(parts: list[Scan]) -> Scan:
 def _unwrap(values: Shaped[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
     """Return times as float64, and which are of the sweep: counters of 32 bits may pass their end within one.
 
-    Neither a few values across that end nor many alike are a sign of it: an underflow made them.
+    Values across that end that are alike are no sign of it: an underflow made them.
     """
     times = values.astype(np.float64)
     good = np.isfinite(times)
@@ -187,8 +187,7 @@ def _unwrap(values: Shaped[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], 
         ahead = times - np.median(times)
         early, late = ahead < -0.5 * _COUNTER, ahead > 0.5 * _COUNTER
         across = early | late
-        share = float(across.mean())
-        if share > MOST_BAD and times[across].std() > _LIKE * share * times[~across].std():
+        if across.any() and times[across].std() > _LIKE * across.mean() * times[~across].std():
             times = times + _COUNTER * early - _COUNTER * late
         else:
             good = ~across
