@@ -241,9 +241,6 @@ def place_recording(
     return Placed(registered.cloud, record, facts, located, registered.low)
 
 
-_FOREIGN = 0.5  # correlation of turns up to which poses that blur the walls are those of another drive
-
-
 def _check_given(recording: Recording, given: Trajectory, reading: ReadingConfig) -> Located:
     """Takes given poses after a look at what they make of some scans: their clock first, then their quaternions.
 
@@ -253,10 +250,9 @@ def _check_given(recording: Recording, given: Trajectory, reading: ReadingConfig
     poses = reorder(given) if told == "wxyz" else given
     clock, timed = settle(recording, poses, auto)
     check = check_poses(recording, timed, told is None)
-    if check is not None and check.blurred and not check.cause and clock.agreement < _FOREIGN:
+    if check is not None and check.blurred and not check.wxyz and clock.offset is None and clock.words:
         raise RecordingError(
-            f"{given.source}: is of another drive than {recording.path}: its turns are other ones (correlation "
-            f"{clock.agreement:.2f}), and its poses blur walls of {1e3 * check.expected:.0f} mm to "
+            f"{recording.path}: {clock.words}; its poses blur walls of {1e3 * check.expected:.0f} mm to "
             f"{1e3 * check.thickness:.0f} mm"
         )
     order = "xyzw (by default)" if told is None else f"{told} (by {'flag' if reading.quaternion else 'header'})"
