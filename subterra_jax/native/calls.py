@@ -57,13 +57,13 @@ def _call(name: str, work: Any, chunk: int, results: Any, *arguments: Any) -> An
 
     Args:
         work: As for `handler_of`.
-        chunk: Fewest rows of a thread: some 50 µs of work, or waking it does not pay.
+        chunk: Rows that a thread takes at a time: some 50 µs of work, or waking it does not pay.
         results: Shapes and types of its results.
         arguments: Arrays of 32-bit numbers; the first axis of the first counts rows.
     """
     rows = arguments[0].shape[0]
     call = jax.ffi.ffi_call(_registered(name, work), results, custom_call_api_version=API_VERSION)
-    return call(sizes_of(rows, min(cores(), rows // chunk), arguments), *arguments)
+    return call(sizes_of(rows, min(cores(), rows // chunk), chunk, arguments), *arguments)
 
 
 def cores() -> int:

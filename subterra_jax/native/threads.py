@@ -23,8 +23,10 @@ _HANDLER = types.void(*[types.intp] * 5)
 _read = types.ExternalFunction("read", signature(types.intp, types.int32, types.intp, types.intp))
 _write = types.ExternalFunction("write", signature(types.intp, types.int32, types.intp, types.intp))
 _yield = types.ExternalFunction("sched_yield", signature(types.int32))
-# What a job is: addresses of results and operands, rows from and to, and whether it is done.
-_RESULTS, _OPERANDS, _FROM, _TO, _DONE, _JOB = range(6)
+# Words of the job that threads share: addresses of results and operands, rows, rows of a chunk, rows done, the state,
+# whether there is a job, and the two ends of the pipe. The state counts jobs above and rows taken below `_ROW_BITS`.
+_RESULTS, _OPERANDS, _ROWS, _CHUNK, _DONE, _STATE, _BUSY, _READ, _WRITE, _WORDS = range(10)
+_ROW_BITS, _ALL_TAKEN = 32, (1 << 32) - 1
 
 
 def _at(kind: types.Type) -> Any:
@@ -48,7 +50,7 @@ _addresses_at, _ints_at, _floats_at = _at(types.intp), _at(types.int32), _at(typ
 def argument(operands, i):
     """Return the i-th argument as a flat array of float32; `.view` gives other numbers of 32 bits."""
     sizes = _ints_at(_addresses_at(operands)[0])
-    return carray(_floats_at(_addresses_at(operands)[i + 1]), (sizes[i + 2],))
+    return carray(_floats_at(_addresses_at(operands)[i + 1]), (sizes[i + 3],))
 
 
 @njit
@@ -66,46 +68,108 @@ def result_of_many(addresses, i, size):
 
 
 @intrinsic
-def _fence(typing: Any) -> Any:
-    """All that was written before is seen by those who see what is written after."""
+def least_of(typing: Any, address: Any) -> Any:
+    """Return the least of 16 numbers of 32 bits, read as whole numbers.
+
+    As numbers, floats that are not negative have the order of their bits, and a negative one has a negative number.
+    Compilers read such a row one by one, which takes as long as making it.
+    """
 
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
-        builder.fence("seq_cst")
-        return context.get_dummy_value()
+        eight = ir.VectorType(ir.IntType(32), 8)
+        first = builder.inttoptr(args[0], eight.as_pointer())
+        one, two = (builder.load(builder.gep(first, [ir.IntType(64)(k)]), align=4) for k in range(2))
+        less = builder.select(builder.icmp_signed("<", one, two), one, two)
+        kind = ir.FunctionType(ir.IntType(32), [eight])
+        name = "llvm.vector.reduce.smin.v8i32"
+        return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), [less])
 
-    return signature(types.void), emit
+    return signature(types.int32, types.intp), emit
+
+
+@intrinsic
+def as_float(typing: Any, number: Any) -> Any:
+    """Return the float of some 32 bits."""
+    return signature(types.float32, types.int32), lambda context, builder, sig, args: builder.bitcast(
+        args[0], ir.FloatType()
+    )
+
+
+@intrinsic
+def _exchange(typing: Any, address: Any, old: Any, new: Any) -> Any:
+    """Write a number over an old one if it still stands there, at once for all threads; return what stood there."""
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
+        pointer = builder.inttoptr(args[0], ir.IntType(64).as_pointer())
+        return builder.extract_value(builder.cmpxchg(pointer, args[1], args[2], "seq_cst", "seq_cst"), 0)
+
+    return signature(types.intp, types.intp, types.intp, types.intp), emit
+
+
+@intrinsic
+def _add(typing: Any, address: Any, number: Any) -> Any:
+    """Add to a number, at once for all threads; return what it was before."""
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
+        pointer = builder.inttoptr(args[0], ir.IntType(64).as_pointer())
+        return builder.atomic_rmw("add", pointer, args[1], "seq_cst")
+
+    return signature(types.intp, types.intp, types.intp), emit
 
 
 # Of each kernel: `handler_of` puts its own in their place.
-work, pipe = None, None
+work, take, job = None, None, None
 
 
 @no_type_check
-def _serve(jobs):
-    address = np.zeros(1, np.int64)
+def _take(at):
+    """Take chunks of the job's rows until all are taken.
+
+    Whoever takes one sees the job that it is of: the state has not changed since that was read.
+    """
+    words = carray(_addresses_at(at), (_WORDS,))
     while True:
-        if _read(types.int32(jobs), address.ctypes.data, 8) == 8:
-            job = carray(_addresses_at(address[0]), (_JOB,))
-            work(job[_RESULTS], job[_OPERANDS], job[_FROM], job[_TO])
-            _fence()
-            job[_DONE] = 1
+        state = _add(at + 8 * _STATE, 0)
+        begin, rows, chunk = state & _ALL_TAKEN, words[_ROWS], words[_CHUNK]
+        results, operands = words[_RESULTS], words[_OPERANDS]
+        if begin >= rows:
+            return
+        if _exchange(at + 8 * _STATE, state, state + chunk) == state:
+            end = min(begin + chunk, rows)
+            work(results, operands, begin, end)
+            _add(at + 8 * _DONE, end - begin)
+
+
+@no_type_check
+def _serve(at):
+    call, words = np.zeros(1, np.int64), carray(_addresses_at(at), (_WORDS,))
+    while True:
+        if _read(types.int32(words[_READ]), call.ctypes.data, 1) == 1:
+            take(at)
 
 
 @no_type_check
 def _answer(results, operands, _, _length, _status):
-    sizes = _ints_at(_addresses_at(operands)[0])
-    rows, n = sizes[0], sizes[1]
-    jobs, address = np.zeros((n, _JOB), np.int64), np.zeros(1, np.int64)
-    for k in range(1, n):
-        jobs[k, _RESULTS], jobs[k, _OPERANDS] = results, operands
-        jobs[k, _FROM], jobs[k, _TO] = rows * k // n, rows * (k + 1) // n
-        address[0] = jobs.ctypes.data + 8 * _JOB * k
-        _write(types.int32(_addresses_at(pipe())[1]), address.ctypes.data, 8)
-    work(results, operands, 0, rows // n)
-    for k in range(1, n):
-        while jobs[k, _DONE] == 0:
-            _yield()
-    _fence()
+    sizes, at, call = _ints_at(_addresses_at(operands)[0]), job(), np.zeros(1, np.int64)
+    rows, threads = sizes[0], sizes[1]
+    # Another call may be under way, on another device of this process.
+    if threads < 2 or _exchange(at + 8 * _BUSY, 0, 1) != 0:
+        work(results, operands, 0, rows)
+        return
+    words = carray(_addresses_at(at), (_WORDS,))
+    # A thread that comes late to the job before finds it taken, and no other until this one is written down.
+    state = words[_STATE]
+    _add(at + 8 * _STATE, ((state >> _ROW_BITS) + 1 << _ROW_BITS) + _ALL_TAKEN - state)
+    words[_RESULTS], words[_OPERANDS], words[_ROWS], words[_CHUNK] = results, operands, rows, sizes[2]
+    words[_DONE] = 0
+    _add(at + 8 * _STATE, -_ALL_TAKEN)
+    for _ in range(1, threads):
+        _write(types.int32(words[_WRITE]), call.ctypes.data, 1)
+    take(at)
+    # Those that others have begun; none waits for a thread that has not woken.
+    while _add(at + 8 * _DONE, 0) < rows:
+        _yield()
+    _add(at + 8 * _BUSY, -1)
 
 
 def _address_of(symbol: str) -> Any:
@@ -139,14 +203,17 @@ def handler_of(work: Callable[..., None], name: str, helpers: int, cache: bool) 
         made.__name__ = made.__qualname__ = name + function.__name__
         return made
 
-    symbol, pipe = f"{name}_pipe", np.array(os.pipe())
-    binding.add_symbol(symbol, pipe.ctypes.data)
-    serve = cfunc(types.void(types.intp), cache=cache)(own(_serve, work=work))
+    symbol, words = f"{name}_job", np.zeros(_WORDS, np.int64)
+    words[_READ], words[_WRITE], words[_STATE] = *os.pipe(), _ALL_TAKEN
+    binding.add_symbol(symbol, words.ctypes.data)
+    take = njit(own(_take, work=work))
+    serve = cfunc(types.void(types.intp), cache=cache)(own(_serve, take=take))
     for _ in range(helpers):
-        threading.Thread(target=serve.ctypes, args=(pipe[0],), daemon=True).start()
-    return cfunc(_HANDLER, cache=cache)(own(_answer, work=work, pipe=_address_of(symbol))), serve, pipe
+        threading.Thread(target=serve.ctypes, args=(words.ctypes.data,), daemon=True).start()
+    answer = own(_answer, work=work, take=take, job=_address_of(symbol))
+    return cfunc(_HANDLER, cache=cache)(answer), serve, words
 
 
-def sizes_of(rows: int, threads: int, arguments: tuple[Any, ...]) -> np.ndarray:
-    """Return the first operand of a call: its rows, threads at most, and the length of each argument."""
-    return np.array([rows, max(1, threads), *(array.size for array in arguments)], np.int32)
+def sizes_of(rows: int, threads: int, chunk: int, arguments: tuple[Any, ...]) -> np.ndarray:
+    """Return the first operand of a call: its rows, threads and rows of a chunk, and the length of each argument."""
+    return np.array([rows, max(1, threads), chunk, *(array.size for array in arguments)], np.int32)
