@@ -1,14 +1,14 @@
 """The planar LiDAR and the clearance as kernels for NVIDIA GPUs: one thread serves one robot, in a warp of 32.
 
 Blocks are visited in the order of `tunnel.order.Order`: from the robot's place on, and then back, each way until the
-plane at a block tells that nothing behind it is nearer than what has been met. Threads that have entered a block wait
-until some others have too, and then all meet their segments together.
+plane at a block tells that nothing behind it is nearer than what has been met. The threads of a warp do so in step, one
+beam after another: nearly every beam enters one block, and all meet what is in theirs together.
 """
 
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,12 +22,8 @@ from subterra_jax.tunnel.packed import BLOCK_WORDS, PAIR_WORDS, unpack
 
 # Threads of one program.
 ROWS = 32
-# Beams that one thread casts, one after another: more of them even out long and short beams, fewer fill the chip.
+# Beams that one thread casts, one after another: more of them read a robot less often, fewer fill the chip.
 BEAMS = 8
-# Threads of 32 that may still be on their way when the others meet their segments.
-UNDER_WAY = 12
-# States of a thread.
-_VISITS, _ENTERED, _ENDED, _IDLE = 0, 1, 2, 3
 
 
 def scan(
@@ -110,102 +106,87 @@ def _call(kernel: Any, grid: tuple[int, ...], size: int) -> Any:
     return call
 
 
-class _Visit(NamedTuple):
-    """Place of a thread on its way."""
+def _march(way: int, start: Array, best: Array, look: Any, meet: Any) -> Array:
+    """Visit blocks one way until nothing nearer can follow, and return the least distance.
 
-    block: Array  # block that it visits
-    way: Array  # 1.0 ahead, -1.0 behind
-    state: Array  # what it does
-    best: Array  # distance of what it has met, m; its square for clearances, m²
+    The threads of a warp go in step: those that have entered a block wait until all others have, or have ended, and
+    then all meet what is in theirs.
 
-    def onward(self, start: Array, enters: Array, ends: Array) -> _Visit:
-        """Return the next visit, from the first block ahead, and whether nothing more is to be found this way."""
-        visits = self.state == _VISITS
-        back = visits & ends & (self.way > 0.0)
-        following = self.block + self.way.astype(jnp.int32)
-        block = jnp.where(back, start - 1, jnp.where(visits & ~enters & ~ends, following, self.block))
-        state = jnp.where(ends & ~back, _ENDED, jnp.where(enters & ~ends, _ENTERED, _VISITS))
-        return self._replace(
-            block=block, way=jnp.where(back, -1.0, self.way), state=jnp.where(visits, state, self.state)
-        )
+    Args:
+        way: 1 for ahead, -1 for behind.
+        start: First block ahead, of each thread.
+        best: Distance of what has been met, m.
+        look: Tells of blocks, and of what has been met, whether the visits end there, and whether the block is entered.
+        meet: Returns the distance of what is in blocks; looks at one pair of vertices alone where its mask is false.
+    """
 
-    def left(self, best: Array) -> _Visit:
-        """Return the visit after those that have entered their block have met what is in it."""
-        entered = self.state == _ENTERED
-        return self._replace(
-            block=self.block + jnp.where(entered, self.way.astype(jnp.int32), 0),
-            state=jnp.where(entered, _VISITS, self.state),
-            best=jnp.where(entered, jnp.minimum(self.best, best), self.best),
-        )
+    def advance(carry: tuple[Array, Array, Array], best: Array) -> tuple[Array, Array, Array]:
+        block, going, _ = carry
+        block = block + way * going
+        ends, enters = look(block, best)
+        return block, (~(ends | enters)).astype(jnp.int32), (~ends).astype(jnp.int32)
+
+    def one_round(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        block, open_, best = carry
+        start = block, open_, open_
+        block, _, open_ = lax.while_loop(lambda c: _any(c[1]), lambda c: advance(c, best), start)
+
+        def met(best: Array) -> Array:
+            return jnp.where(open_ > 0, jnp.minimum(best, meet(block, open_ > 0)), best)
+
+        return block, open_, lax.cond(_any(open_), met, lambda best: best, best)
+
+    before = start - 1 if way > 0 else start
+    return lax.while_loop(lambda c: _any(c[1]), one_round, (before, jnp.ones_like(start), best))[2]
 
 
-class _Beam(NamedTuple):
-    """The beams that threads cast."""
-
-    number: Array  # of each thread's beam
-    d_x: Array  # its direction
-    d_y: Array  # the other coordinate
+def _any(flags: Array) -> Array:
+    """Tell whether a flag, 0 or 1, of any thread is set."""
+    return jnp.sum(flags) > 0
 
 
 def _scan_kernel(
     start_ref, needed_ref, x_ref, y_ref, heading_ref, turn_ref, limit_ref, block_ref, wall_ref, range_ref, *,
     n_beams: int, n_some: int, n_rows: int,
 ) -> None:  # fmt: skip
-    """Cast some beams of each of many robots, each thread those of one robot in its own time."""
+    """Cast some beams of each of many robots, one robot a thread, one beam after another."""
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
 
     row = pl.program_id(1) * n_rows + lax.broadcasted_iota(jnp.int32, (n_rows,), 0)
-    first_beam = pl.program_id(0) * n_some
     start, needed, x, y, heading = (
         triton.load(ref.at[row]) for ref in (start_ref, needed_ref, x_ref, y_ref, heading_ref)
     )
-    cos, sin, limit = jnp.cos(heading), jnp.sin(heading), jnp.full((n_rows,), triton.load(limit_ref.at[jnp.int32(0)]))
+    # Of a tunnel's first two blocks, which are padding, nothing is seen.
+    start = jnp.where(needed > 0, start, 1)
+    cos, sin, first_beam = jnp.cos(heading), jnp.sin(heading), pl.program_id(0) * n_some
+    limit = jnp.full((n_rows,), triton.load(limit_ref.at[jnp.int32(0)]))
 
-    def aim(number) -> _Beam:
-        along, across = triton.load(turn_ref.at[number]), triton.load(turn_ref.at[n_beams + number])
-        return _Beam(number, cos * along - sin * across, sin * along + cos * across)
+    def cast(i: Array, _: None) -> None:
+        beam = first_beam + i
+        along, across = triton.load(turn_ref.at[beam]), triton.load(turn_ref.at[n_beams + beam])
+        d_x, d_y = cos * along - sin * across, sin * along + cos * across
 
-    def advance(beam: _Beam, visit: _Visit) -> _Visit:
-        m_x, m_y, e_x, e_y, thickness, _, n_x, n_y, ahead, behind, _ = _block(block_ref, visit.block)
-        m_x, m_y, n_x, n_y = m_x - x, m_y - y, n_x * visit.way, n_y * visit.way
-        gap = n_x * m_x + n_y * m_y + jnp.where(visit.way > 0.0, ahead, behind)
-        ends = gap > jnp.maximum(visit.best * (n_x * beam.d_x + n_y * beam.d_y), 0.0)
-        beside = jnp.abs(beam.d_x * m_y - beam.d_y * m_x) - jnp.abs(beam.d_x * e_y - beam.d_y * e_x)
-        along, half = beam.d_x * m_x + beam.d_y * m_y, jnp.abs(beam.d_x * e_x + beam.d_y * e_y) + thickness
-        enters = (beside <= thickness) & (along + half >= 0.0) & (along - half <= visit.best)
-        return visit.onward(start, enters, ends)
+        def look(way: int, block: Array, best: Array) -> tuple[Array, Array]:
+            m_x, m_y, e_x, e_y, thickness, _, n_x, n_y, *planes, _ = _block(block_ref, block)
+            m_x, m_y = m_x - x, m_y - y
+            gap = way * (n_x * m_x + n_y * m_y) + planes[0 if way > 0 else 1]
+            ends = gap > jnp.maximum(best * (way * (n_x * d_x + n_y * d_y)), 0.0)
+            beside = jnp.abs(d_x * m_y - d_y * m_x) - jnp.abs(d_x * e_y - d_y * e_x)
+            along, half = d_x * m_x + d_y * m_y, jnp.abs(d_x * e_x + d_y * e_y) + thickness
+            return ends, (beside <= thickness) & (along + half >= 0.0) & (along - half <= best)
 
-    def meet(beam: _Beam, visit: _Visit) -> _Visit:
-        words = _block(block_ref, visit.block)
-        middle, pairs = (words[0] - x, words[1] - y), jnp.where(visit.state == _ENTERED, words[5], 1)
-        return visit.left(_nearest(wall_ref, words[10], pairs, middle, beam))
+        def meet(block: Array, entered: Array) -> Array:
+            words = _block(block_ref, block)
+            middle = words[0] - x, words[1] - y
+            return _nearest(wall_ref, words[10], jnp.where(entered, words[5], 1), middle, (d_x, d_y))
 
-    def one_round(carry: tuple[_Beam, _Visit]) -> tuple[_Beam, _Visit]:
-        beam, visit = carry
-        few = (n_rows - _count(visit.state, _IDLE)) * UNDER_WAY // ROWS
-        visit = lax.while_loop(lambda v: _count(v.state, _VISITS) > few, partial(advance, beam), visit)
-        visit = lax.cond(_count(visit.state, _ENTERED) > 0, partial(meet, beam), lambda v: v, visit)
-        ended = visit.state == _ENDED
-        triton.store(range_ref.at[row * n_beams + beam.number], visit.best, mask=ended)
-        last = beam.number == first_beam + n_some - 1
-        beam = aim(jnp.where(ended & ~last, beam.number + 1, beam.number))
-        state = jnp.where(ended, jnp.where(last, _IDLE, _VISITS), visit.state)
-        begins = ended & ~last
-        return beam, _Visit(
-            jnp.where(begins, start, visit.block),
-            jnp.where(begins, 1.0, visit.way),
-            state,
-            jnp.where(begins, limit, visit.best),
-        )
+        best = limit
+        for way in (1, -1):
+            best = _march(way, start, best, partial(look, way), meet)
+        triton.store(range_ref.at[row * n_beams + beam], best)
 
-    begin = _Visit(start, jnp.ones_like(x), jnp.where(needed > 0, _VISITS, _IDLE), limit)
-    beam = aim(jnp.full((n_rows,), first_beam, jnp.int32))
-    lax.while_loop(lambda carry: _count(carry[1].state, _IDLE) < n_rows, one_round, (beam, begin))
-
-
-def _count(state, what: int):
-    return jnp.sum((state == what).astype(jnp.int32))
+    lax.fori_loop(0, jnp.max(needed) * n_some, cast, None)
 
 
 def _block(block_ref, number):
@@ -214,12 +195,12 @@ def _block(block_ref, number):
     return *unpack((*one, *two[:2])), two[2]
 
 
-def _nearest(wall_ref, first_pair, pairs, middle, beam: _Beam):
+def _nearest(wall_ref, first_pair, pairs, middle, direction):
     """Return the distance at which each beam meets a block, m; `inf` if it does not.
 
-    `cast._distances` has the geometry.
+    `planar._distances` has the geometry.
     """
-    d_x, d_y = beam.d_x, beam.d_y
+    d_x, d_y = direction
     middle_left, middle_ahead = d_x * middle[1] - d_y * middle[0], d_x * middle[0] + d_y * middle[1]
     joint = 2e-7 * (1.0 + jnp.abs(middle_ahead))
 
@@ -254,11 +235,10 @@ def _gap_kernel(start_ref, x_ref, y_ref, block_ref, wall_ref, gap_ref, *, n_rows
     row = pl.program_id(0) * n_rows + lax.broadcasted_iota(jnp.int32, (n_rows,), 0)
     start, x, y = (triton.load(ref.at[row]) for ref in (start_ref, x_ref, y_ref))
 
-    def advance(visit: _Visit) -> _Visit:
-        m_x, m_y, e_x, e_y, thickness, _, n_x, n_y, ahead, behind, _ = _block(block_ref, visit.block)
+    def look(way: int, block: Array, best: Array) -> tuple[Array, Array]:
+        m_x, m_y, e_x, e_y, thickness, _, n_x, n_y, *planes, _ = _block(block_ref, block)
         m_x, m_y = m_x - x, m_y - y
-        gap = (n_x * m_x + n_y * m_y) * visit.way + jnp.where(visit.way > 0.0, ahead, behind)
-        ends = (gap > 0.0) & (gap * gap > visit.best)
+        gap = way * (n_x * m_x + n_y * m_y) + planes[0 if way > 0 else 1]
         squared = e_x * e_x + e_y * e_y
         # Not the best so far: from within a pocket its wall is nearer than the box, whose lid closes it.
         near = CONTACT_REACH + thickness + 1e-3
@@ -266,21 +246,16 @@ def _gap_kernel(start_ref, x_ref, y_ref, block_ref, wall_ref, gap_ref, *, n_rows
         beside = jnp.abs(m_x * e_y - m_y * e_x) <= near * length + 1e-6
         # A packed axis is turned a little, and the box is longer by its half thickness at most.
         along = jnp.abs(m_x * e_x + m_y * e_y) <= (length + near) * length + 1e-6
-        return visit.onward(start, beside & along & (thickness >= 0.0), ends)
+        return (gap > 0.0) & (gap * gap > best), beside & along & (thickness >= 0.0)
 
-    def meet(visit: _Visit) -> _Visit:
-        words = _block(block_ref, visit.block)
-        middle, pairs = (words[0] - x, words[1] - y), jnp.where(visit.state == _ENTERED, words[5], 1)
-        return visit.left(_least_square(wall_ref, words[10], pairs, middle))
+    def meet(block: Array, entered: Array) -> Array:
+        words = _block(block_ref, block)
+        return _least_square(wall_ref, words[10], jnp.where(entered, words[5], 1), (words[0] - x, words[1] - y))
 
-    def one_round(visit: _Visit) -> _Visit:
-        visit = lax.while_loop(lambda v: _count(v.state, _VISITS) > 0, advance, visit)
-        return lax.cond(_count(visit.state, _ENTERED) > 0, meet, lambda v: v, visit)
-
-    reach = jnp.full((n_rows,), CONTACT_REACH * CONTACT_REACH, jnp.float32)
-    begin = _Visit(start, jnp.ones_like(x), jnp.full((n_rows,), _VISITS, jnp.int32), reach)
-    visit = lax.while_loop(lambda v: _count(v.state, _ENDED) < n_rows, one_round, begin)
-    triton.store(gap_ref.at[row], jnp.where(visit.best < reach, jnp.sqrt(visit.best), CONTACT_REACH))
+    best = reach = jnp.full((n_rows,), CONTACT_REACH * CONTACT_REACH, jnp.float32)
+    for way in (1, -1):
+        best = _march(way, start, best, partial(look, way), meet)
+    triton.store(gap_ref.at[row], jnp.where(best < reach, jnp.sqrt(best), CONTACT_REACH))
 
 
 def _least_square(wall_ref, first_pair, pairs, middle):
