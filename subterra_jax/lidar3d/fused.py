@@ -29,8 +29,8 @@ def find(
     """Find the first triangle that each ray meets, and its normal, as `march.march` and `meeting.normals`.
 
     Rays have a place each, or the images of `n` scans, each of a multiple of 32 rays, one; results are shaped likewise.
-    A scan's place is read by its programs, and not written down for each of its rays. They take the image column by
-    column: rays of a few azimuths go about as far, those of a whole ring do not, and a warp waits for the longest.
+    A scan's place is read by its programs, and not written down for each of its rays. They take the image tile by
+    tile: rays of a few azimuths go about as far, those of a whole ring do not, and a warp waits for the longest.
     """
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
@@ -61,7 +61,7 @@ def find(
 
 
 def _kernel(*refs: Any, image: tuple[int, int] | None) -> None:
-    """March 32 rays, those of an image column by column."""
+    """March 32 rays, those of an image by tiles."""
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
 
@@ -87,8 +87,17 @@ def _kernel(*refs: Any, image: tuple[int, int] | None) -> None:
             triton.store(ref.at[mine], part)
 
 
+def _tile(image: tuple[int, int]) -> tuple[int, int]:
+    """Return the rows and columns of a tile of 32 rays: columns are near one another in images with many of them."""
+    fits = [k for k in (1, 2, 4, 8, 16, 32) if image[0] % k == 0 and image[1] % (ROWS // k) == 0]
+    tall = max((k for k in fits if k <= (16 if image[1] < 512 else 8)), default=fits[0])
+    return tall, ROWS // tall
+
+
 def _rays_of(image: tuple[int, int], program: Array) -> Int[Array, ROWS]:
-    """Return the rays of a program, images of so many rows and columns being cut into 32 rays column by column."""
-    ray = program * ROWS + jax.lax.broadcasted_iota(jnp.int32, (ROWS,), 0)
-    scan, within = ray // (image[0] * image[1]), ray % (image[0] * image[1])
-    return scan * (image[0] * image[1]) + within % image[0] * image[1] + within // image[0]
+    """Return the rays of a program, those of one tile of an image, column by column."""
+    (rows, columns), (tall, wide) = image, _tile(image)
+    lane, tiles, across = jax.lax.broadcasted_iota(jnp.int32, (ROWS,), 0), rows * columns // ROWS, columns // wide
+    scan, tile = program // tiles, program % tiles
+    row, column = tile // across * tall + lane % tall, tile % across * wide + lane // tall
+    return (scan * rows + row) * columns + column
