@@ -9,7 +9,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from subterra_jax import lidar3d
-from subterra_jax.lidar import LidarParams, cast
+from subterra_jax.lidar import LidarParams, nearest
 from subterra_jax.lidar3d import beams
 from subterra_jax.lidar3d.relief import Relief
 from subterra_jax.lidar3d.space import into_tunnel, turned
@@ -258,7 +258,7 @@ def _walls(
     # A beam straight up meets no wall; the division must not make it NaN.
     level = jnp.maximum(level, 1e-3)
     first = sensing.tunnel.scan_first[node_at(sensing.tunnel, sensing.station)]
-    return cast.nearest(sensing.tunnel, first, origin[:2], directions[:, :2] / level[:, None]) / level
+    return nearest(sensing.tunnel, first, origin[:2], directions[:, :2] / level[:, None]) / level
 
 
 def _ground(

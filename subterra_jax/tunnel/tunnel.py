@@ -23,7 +23,9 @@ GROUP = 16  # blocks that a CPU looks at together; there are twice as many of pa
 WIDTH = 16  # segments that a CPU looks at together
 BLOCK_LENGTH, MOST_SEGMENTS = 2.0, 16  # of a block of wall: m, about; they affect speed alone
 # Boxes sorted by where a beam enters them; speed alone. Beside furniture it enters more without touching what is there.
-_CANDIDATES, _CANDIDATES_FURNISHED = 3, 8
+_CANDIDATES, _CANDIDATES_FURNISHED = 3, 5
+# What a stack has of each of its tunnels.
+_NUMBERS = ("length", "spacing", "ring_pitch", "first_node", "n_nodes", "texture")
 
 
 @struct.dataclass
@@ -95,10 +97,7 @@ class Tunnel:
         """
         if self.count == 1:
             return self
-        one = self._with_numbers(
-            *(numbers[index] for numbers in (self.length, self.spacing, self.ring_pitch)),
-            *(numbers[index] for numbers in (self.first_node, self.n_nodes, self.texture)),
-        )
+        one = self._with_numbers(*(getattr(self, name)[index] for name in _NUMBERS))
         return one if self.space is None else dataclasses.replace(one, space=self.space.pick(index))
 
     @property
@@ -111,8 +110,7 @@ class Tunnel:
         return bare._with_numbers(*(np.float32(0.0),) * 3, *(np.int32(0),) * 3)
 
     def _with_numbers(self, *numbers: Any) -> "Tunnel":
-        names = ("length", "spacing", "ring_pitch", "first_node", "n_nodes", "texture")
-        return dataclasses.replace(self, **dict(zip(names, numbers, strict=True)))
+        return dataclasses.replace(self, **dict(zip(_NUMBERS, numbers, strict=True)))
 
     @classmethod
     def from_plan(
@@ -264,21 +262,15 @@ def stack(tunnels: Sequence[Tunnel]) -> Tunnel:
     first_block, first_node = (np.concatenate([[0], np.cumsum(n)[:-1]]).astype(np.int32) for n in (n_blocks, n_nodes))
     box, wall = np.concatenate([box for box, _ in parts], axis=1), np.concatenate([wall for _, wall in parts])
     put = jax.device_put  # `jnp.asarray` would compile a program for each new shape
-    numbers = lambda name: put(np.stack([np.asarray(getattr(t, name)) for t in tunnels]))  # noqa: E731
-    shifted = lambda name: put(  # noqa: E731
-        np.concatenate([np.asarray(getattr(t, name)) + b for t, b in zip(tunnels, first_block, strict=True)])
-    )
+    numbers = {name: put(np.stack([np.asarray(getattr(t, name)) for t in tunnels])) for name in _NUMBERS}
+    shifted = {
+        name: put(np.concatenate([np.asarray(getattr(t, name)) + b for t, b in zip(tunnels, first_block, strict=True)]))
+        for name in ("scan_first", "contact_first", "visit_first")
+    }
     return Tunnel(
-        length=numbers("length"),
-        spacing=numbers("spacing"),
-        ring_pitch=numbers("ring_pitch"),
-        first_node=put(first_node),
-        n_nodes=numbers("n_nodes"),
-        texture=numbers("texture"),
+        **{**numbers, "first_node": put(first_node)},
+        **shifted,
         grid=put(np.concatenate([np.asarray(t.grid) for t in tunnels])),
-        scan_first=shifted("scan_first"),
-        contact_first=shifted("contact_first"),
-        visit_first=shifted("visit_first"),
         box=put(box),
         wall=put(wall),
         reach=min(t.reach for t in tunnels),
