@@ -131,7 +131,7 @@ MISTAKES = {
     "benchmarks.slam board --sets empty x/empty --out o": "sets must differ in the last part of their names",
     "benchmarks.slam board --sets empty --out o": "empty: holds no recordings",
     "benchmarks.slam board --sets empty --out o --programs moon": "no program 'moon'; there are wheel-odometry",
-    "benchmarks.slam board --sets empty --out o --no-run": "empty: holds no recordings",
+    "benchmarks.slam board --sets empty --out o --programs wheel-odometry": "empty: holds no recordings",
     "benchmarks.slam board --out o": "sets and programs must name at least one",
     "benchmarks.slam score --estimate --truth empty": "estimate must name at least one",
     "benchmarks.slam score --estimate junk.tum --truth junk.tum": "junk.tum",

@@ -21,21 +21,11 @@ from benchmarks.slam.board import BoardConfig, make_board
 from benchmarks.slam.score import ScoreConfig, score_all
 
 _progress = Console(stderr=True, highlight=False)
-_PROG = "python -m benchmarks.slam"
-_ARENA = f"""Record the arena: drives for LiDAR-inertial programs, from smooth walls to rough ones.
-
-Example: {_PROG} arena --out out/arena"""
-_BOARD = f"""Run and score every program on sets of the arena.
-
-Example: {_PROG} board --sets out/arena --out out/board --jobs 2"""
-_SCORE = f"""Score TUM files against the truth.
-
-Example: {_PROG} score --estimate out/board/poses/arena/evalio-kiss --truth out/arena/truth --out out/scores"""
 
 Command = (
-    Annotated[ArenaConfig, tyro.conf.subcommand("arena", description=_ARENA)]
-    | Annotated[BoardConfig, tyro.conf.subcommand("board", description=_BOARD)]
-    | Annotated[ScoreConfig, tyro.conf.subcommand("score", description=_SCORE)]
+    Annotated[ArenaConfig, tyro.conf.subcommand("arena")]
+    | Annotated[BoardConfig, tyro.conf.subcommand("board")]
+    | Annotated[ScoreConfig, tyro.conf.subcommand("score")]
 )
 
 
@@ -54,6 +44,8 @@ def main(config: ArenaConfig | BoardConfig | ScoreConfig) -> None:
         _write_board(config.out)
     else:
         scores = score_all(config)
+        for doubt in score.doubts(config, scores):
+            _progress.print(f"warning: {doubt}", soft_wrap=True)
         if config.out is not None:
             write_file(config.out / "scores.json", score.as_json(scores, environment_facts()).encode())
             write_file(config.out / "scores.md", score.as_markdown(scores).encode())

@@ -29,7 +29,6 @@ from subterra_jax.evaluation.localisability import LEAST_SLOPE, PLACES, fit_slop
 from subterra_jax.host.files import replace_file
 
 SCHEMA = "subterra.arena-board/2"
-_SLOWEST = ("evalio-form", "evalio-genz", "evalio-ct")
 _ALONE = "import sys; from benchmarks.slam.programs import main; sys.exit(main(sys.argv[1:]))"
 _SAYS = '{"poses"'  # beginning of the line in which the process reports
 _KEPT = ("distance", "covered", "drift", "along_final", "along_rms", "across_rms", "up_rms", "reach")
@@ -114,7 +113,10 @@ def describe(result: dict[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class BoardConfig:
-    """Settings of a board."""
+    """Runs and scores every program on sets of the arena.
+
+    Example: python -m benchmarks.slam board --sets out/arena --out out/slam --jobs 2
+    """
 
     out: Path  # Folder for poses, `board.json`, `board.md`, `board.png` and `records.json`.
     sets: tuple[Path, ...] = ()  # Sets of the arena with their truth, one for each seed.
@@ -122,8 +124,6 @@ class BoardConfig:
     programs: tuple[str, ...] = tuple(name for name in (WHEELS, *PROGRAMS) if name not in FURTHER)
     jobs: int = 1  # Programs run at a time.
     limit: float = 1800.0  # Time after which a program counts as failed on a recording, s.
-    # Run what is missing; otherwise only poses that are in `out` already are scored, and no bag is needed.
-    run: bool = True
 
 
 def plan_board(config: BoardConfig) -> list[Case]:
@@ -131,7 +131,7 @@ def plan_board(config: BoardConfig) -> list[Case]:
 
     Raises:
         BenchmarkError: A program is unknown or not installed, a set holds no recordings or no truth, a bag that is
-            to be run on is damaged, two sets have one name, or there is nothing to score.
+            to be run on is damaged, or two sets have one name.
     """
     require_least(config, jobs=1)
     if not config.programs or not config.sets:
@@ -139,7 +139,7 @@ def plan_board(config: BoardConfig) -> list[Case]:
     if len({folder.name for folder in config.sets}) < len(config.sets):
         raise BenchmarkError("sets must differ in the last part of their names")
     for name in config.programs:
-        find_program(name, installed=config.run)
+        find_program(name)
     cases = []
     for folder in config.sets:
         for recording in recordings_in(folder):
@@ -148,11 +148,8 @@ def plan_board(config: BoardConfig) -> list[Case]:
             cases += [Case(program, recording, place / program) for program in some]
             if cases and not cases[-1].truth.is_file():
                 raise BenchmarkError(f"{folder}: holds no truth of {recording.name}")
-    for recording in {one.recording for one in cases if config.run and not one.facts.is_file()}:
+    for recording in {one.recording for one in cases if not one.facts.is_file()}:
         check_recording(recording)  # a damaged bag is no failure of a program
-    cases = [one for one in cases if config.run or one.program == WHEELS or one.facts.is_file()]
-    if all(one.program == WHEELS for one in cases) and any(name != WHEELS for name in config.programs):
-        raise BenchmarkError(f"{config.out}: holds no poses of {', '.join(config.programs)} to score")
     return cases
 
 
@@ -163,10 +160,8 @@ def make_board(config: BoardConfig) -> Iterator[tuple[str, str]]:
         BenchmarkError: See `plan_board`.
     """
     cases = plan_board(config)
-    # The slowest programs begin first, so that the last case does not wait for one of them.
-    order = sorted(cases, key=lambda one: one.program not in _SLOWEST)
     with ThreadPoolExecutor(config.jobs) as pool:
-        futures = {pool.submit(run_case, one, config.limit): one for one in order}
+        futures = {pool.submit(run_case, one, config.limit): one for one in cases}
         for future in as_completed(futures):
             one = futures[future]
             yield f"{one.place.parent.name} {one.name} {one.program}", describe(future.result())

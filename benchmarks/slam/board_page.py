@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.records import Record, of_facts
 from benchmarks.results import markdown_table
+from benchmarks.slam.programs import PROGRAMS, WHEELS
 
 Row = dict[str, Any]
 _PANELS = {
@@ -29,7 +30,9 @@ _NAMES = {
     "texture-smooth-100": "smooth, texture 1", "texture-joints-100": "joints, texture 1",
     "texture-sprayed-100": "sprayed, texture 1", "doppler-smooth": "smooth, Doppler",
 }  # fmt: skip
-_OURS = {"wheel-odometry": ("0.3", "s")}  # colour and marker of what is not a SLAM program
+# Colour and marker of a program, in every figure; diamonds are ours.
+_STYLES = {name: (plt.get_cmap("tab20")(k % 20), "o" if one.package else "D") for k, (name, one) in
+           enumerate(PROGRAMS.items())} | {WHEELS: ("0.3", "s")}  # fmt: skip
 _ASIDE = 0.05  # of the distance between two recordings, from one program to the next
 _LEAST = 3e-5  # m per 100 m, lower end of the figure
 
@@ -147,11 +150,10 @@ def draw_board(board: dict[str, Any]) -> Figure:
 
 def _draw_panel(axes: Axes, board: dict[str, Any], title: str, names: list[str]) -> None:
     at, programs = np.arange(len(names)), _programs(board)
-    others = [name for name in programs if name not in _OURS]
     for k, program in enumerate(programs):
         found = [median_drift(board["rows"], program, name) or (np.nan,) * 3 for name in names]
         middle, low, high = np.maximum(np.array(found, float), _LEAST).T
-        colour, marker = _OURS.get(program) or (plt.get_cmap("tab20")(others.index(program) % 20), "o")
+        colour, marker = _STYLES.get(program, ("k", "x"))
         place = at + _ASIDE * (k - 0.5 * (len(programs) - 1))
         axes.errorbar(
             place, middle, [middle - low, high - middle], fmt=marker, ms=4, lw=1.2, capsize=2, color=colour,

@@ -1,7 +1,7 @@
 """Programs for SLAM, with their own defaults and one thread: `evalio`'s, `rko-lio` and ours.
 
 `main` runs one in this process: it reads the bag, feeds sweeps and IMU samples in order, writes the LiDAR's poses and
-prints one line of JSON. The libraries are optional (`pip install 'subterra-jax[slam]'`).
+prints one line of JSON. The libraries are optional (`pip install -e '.[slam]'`).
 """
 
 import json
@@ -179,8 +179,8 @@ PROGRAMS = {
 FURTHER = ("genz-lio", "pelorus", "se3-lio")  # whose packages are no part of the extra `slam`
 
 
-def find_program(name: str, installed: bool = True) -> str:
-    """Returns the version of a program's package; empty for the robot's own odometry, and where it need not be there.
+def find_program(name: str) -> str:
+    """Returns the version of a program's package; empty for the robot's own odometry.
 
     Raises:
         BenchmarkError: There is no such program, or it is not installed.
@@ -194,8 +194,6 @@ def find_program(name: str, installed: bool = True) -> str:
     try:
         return version(package)
     except PackageNotFoundError as error:
-        if not installed:
-            return ""
         raise BenchmarkError(f"{name} needs {package}, which is not installed: pip install {package}") from error
 
 

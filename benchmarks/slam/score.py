@@ -11,15 +11,7 @@ from jaxtyping import Float
 from benchmarks.command import BenchmarkError
 from benchmarks.results import markdown_table
 from benchmarks.slam.reading import TRUTH_FILE
-from benchmarks.slam.tracks import (
-    Alignment,
-    Axis,
-    Track,
-    align,
-    axis_from_file,
-    axis_from_path,
-    read_track,
-)
+from benchmarks.slam.tracks import Alignment, Track, align, axis_from_file, axis_from_path, read_track
 
 
 def absolute_errors(track: Track) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
@@ -57,14 +49,8 @@ class Score:
     # Distance driven when the error of the station first exceeds 1 m, m; `None` where it never does
     reach: float | None = None
     late: float | None = None  # How much later the turns show the estimate's clock to be, s; from 10 ms on
-
-
-@dataclasses.dataclass(frozen=True)
-class Curve:
-    """Errors against distance: `travelled (n,)` and `error (n, 3)` of station, offset and height, m."""
-
-    travelled: Float[np.ndarray, " n"]
-    error: Float[np.ndarray, "n 3"]
+    after: float = 0.0  # Time for which the estimate goes on after the truth's end, s
+    program: str = ""  # Name of the folder of estimates
 
 
 def score_files(
@@ -73,16 +59,14 @@ def score_files(
     *,
     axis: Path | None = None,
     alignment: Alignment = "origin",
-    name: str = "",
-) -> tuple[Score, Curve]:
-    """Scores one TUM file against another.
+) -> tuple[Score, Float[np.ndarray, "n 3"]]:
+    """Scores one TUM file against another; returns its errors of station, offset and height at each pose as well, m.
 
     Args:
         estimate: TUM file of a SLAM program.
         truth: `lidar.tum` of a recording's truth.
         axis: `axis.csv`; by default the one beside the truth, or else the true path gives the directions.
         alignment: `origin`, `se3` or `none`.
-        name: Name of the recording; by default the estimate's file name.
 
     Raises:
         BenchmarkError: A file is missing or wrong, the trajectories share no times, or the poses are not the LiDAR's.
@@ -96,7 +80,17 @@ def score_files(
     if axis is None and (truth.parent / AXIS_FILE).is_file():
         axis = truth.parent / AXIS_FILE
     line = axis_from_path(track.true_position) if axis is None else axis_from_file(axis)
-    return score_track(track, line, alignment, name or estimate.stem)
+    error, turn = absolute_errors(track)
+    parts, travelled = line.coordinates(track.position) - line.coordinates(track.true_position), track.travelled
+    distance = float(travelled[-1])
+    score = Score(
+        name=estimate.stem, distance=distance, covered=track.covered, poses=len(track.time), alignment=alignment,
+        axis=line.source, along_final=float(parts[-1, 0]), along_rms=rms(parts[:, 0]), across_rms=rms(parts[:, 1]),
+        up_rms=rms(parts[:, 2]), drift=100.0 * abs(float(parts[-1, 0])) / distance if distance > 0.0 else None,
+        ape=rms(np.linalg.norm(error, axis=1)), ape_turn=rms(np.degrees(turn)),
+        reach=reach_of(travelled, parts[:, 0]), late=track.late, after=track.after,
+    )  # fmt: skip
+    return score, parts
 
 
 LEAST_RATE = 1.0  # poses a second; fewer leave out where a program errs
@@ -145,21 +139,6 @@ def _check_frame(estimate: Path, track: Track) -> None:
         )
 
 
-def score_track(track: Track, axis: Axis, alignment: str, name: str) -> tuple[Score, Curve]:
-    """Scores an aligned track; returns its errors against distance as well."""
-    error, turn = absolute_errors(track)
-    parts, travelled = axis.coordinates(track.position) - axis.coordinates(track.true_position), track.travelled
-    distance = float(travelled[-1])
-    score = Score(
-        name=name, distance=distance, covered=track.covered, poses=len(track.time), alignment=alignment,
-        axis=axis.source, along_final=float(parts[-1, 0]), along_rms=rms(parts[:, 0]), across_rms=rms(parts[:, 1]),
-        up_rms=rms(parts[:, 2]), drift=100.0 * abs(float(parts[-1, 0])) / distance if distance > 0.0 else None,
-        ape=rms(np.linalg.norm(error, axis=1)), ape_turn=rms(np.degrees(turn)),
-        reach=reach_of(travelled, parts[:, 0]), late=track.late,
-    )  # fmt: skip
-    return score, Curve(travelled, parts)
-
-
 REACH_ERROR = 1.0  # m
 
 
@@ -171,7 +150,10 @@ def reach_of(travelled: Float[np.ndarray, " n"], along: Float[np.ndarray, " n"])
 
 @dataclasses.dataclass(frozen=True)
 class ScoreConfig:
-    """Settings of a scoring."""
+    """Scores TUM files against the truth.
+
+    Example: python -m benchmarks.slam score --estimate out/slam/poses/arena/evalio-kiss --truth out/arena/truth
+    """
 
     estimate: tuple[Path, ...]  # TUM files, or folders of `NAME.tum`, each folder one program.
     truth: Path  # TUM file, or the `truth/` folder of a set.
@@ -181,15 +163,7 @@ class ScoreConfig:
     out: Path | None = None  # Folder for `scores.json` and `scores.md`.
 
 
-@dataclasses.dataclass(frozen=True)
-class ProgramScore:
-    """A score with its program."""
-
-    program: str
-    score: Score
-
-
-def score_all(config: ScoreConfig) -> list[ProgramScore]:
+def score_all(config: ScoreConfig) -> list[Score]:
     """Scores every given estimate.
 
     Raises:
@@ -200,15 +174,31 @@ def score_all(config: ScoreConfig) -> list[ProgramScore]:
     return [score for path in config.estimate for score in _score_path(path, config)]
 
 
-def _score_path(path: Path, config: ScoreConfig) -> list[ProgramScore]:
+def _score_path(path: Path, config: ScoreConfig) -> list[Score]:
     if not path.exists():
         raise BenchmarkError(f"{path}: no such file or folder")
     pairs = _pairs(path, config.truth) if path.is_dir() else [(path, _find_truth(path, config.truth))]
     program, scores = path.name if path.is_dir() else path.parent.name, []
     for estimate, truth in pairs:
-        score, _ = score_files(estimate, truth, axis=config.axis, alignment=config.alignment, name=estimate.stem)
-        scores.append(ProgramScore(program, score))
+        score, _ = score_files(estimate, truth, axis=config.axis, alignment=config.alignment)
+        scores.append(dataclasses.replace(score, program=program))
     return scores
+
+
+_LEAST_AFTER = 1.0  # s after the truth's end that a program may still report
+
+
+def doubts(config: ScoreConfig, scores: list[Score]) -> list[str]:
+    """Returns a sentence on each file without truth, each drive not handed in, and poses after a truth's end."""
+    said = [f"{one.program} on {one.name}: {one.after:.0f} s of poses lie after the truth's end: another drive?"
+            for one in scores if one.after > _LEAST_AFTER]  # fmt: skip
+    for folder in (path for path in config.estimate if path.is_dir()):
+        given = {path.stem for path in folder.glob("*.tum")}
+        known = {path.parent.name for path in config.truth.glob(f"*/{TRUTH_FILE}")}
+        said += [f"{folder}: {name}.tum is left out: there is no such drive" for name in sorted(given - known)]
+        if missing := sorted(known - given):
+            said.append(f"{folder}: holds no poses of {', '.join(missing)}")
+    return said
 
 
 def _find_truth(estimate: Path, truth: Path) -> Path:
@@ -238,33 +228,31 @@ HEAD = (
 )  # fmt: skip
 
 
-def as_rows(scores: list[ProgramScore]) -> list[tuple[str, ...]]:
+def as_rows(scores: list[Score]) -> list[tuple[str, ...]]:
     """Returns the cells of the table below `HEAD`, by recording and program."""
 
     def cell(value: float | None, digits: int = 2) -> str:
         return "" if value is None else f"{value:.{digits}f}"
 
     rows: list[tuple[str, ...]] = []
-    for one in sorted(scores, key=lambda one: (one.score.name, one.program)):
-        s = one.score
+    for s in sorted(scores, key=lambda one: (one.name, one.program)):
         rows.append((
-            s.name, one.program, cell(s.distance, 1), cell(100.0 * s.covered, 0), f"{s.along_final:+.2f}",
+            s.name, s.program, cell(s.distance, 1), cell(100.0 * s.covered, 0), f"{s.along_final:+.2f}",
             cell(s.drift), cell(s.along_rms, 3), cell(s.across_rms, 3), cell(s.up_rms, 3), cell(s.ape, 3),
             cell(s.ape_turn, 2), cell(s.late, 3),
         ))  # fmt: skip
     return rows
 
 
-def as_markdown(scores: list[ProgramScore]) -> str:
+def as_markdown(scores: list[Score]) -> str:
     """Returns the table with a note on its columns."""
-    first = scores[0].score
     return markdown_table(HEAD, as_rows(scores)) + (
-        f"\nRoot mean squares over the recording, alignment `{first.alignment}`; APE is that of `evo`. A clock is "
+        f"\nRoot mean squares over the recording, alignment `{scores[0].alignment}`; APE is that of `evo`. A clock is "
         "late where turns of estimate and truth agree best so; errors stand as they are.\n"
     )
 
 
-def as_json(scores: list[ProgramScore], facts: dict[str, Any]) -> str:
+def as_json(scores: list[Score], facts: dict[str, Any]) -> str:
     """Returns `scores.json`."""
-    rows = [{"program": one.program, **dataclasses.asdict(one.score)} for one in scores]
+    rows = [dataclasses.asdict(one) for one in scores]
     return json.dumps({"schema": SCHEMA, **facts, "scores": rows}, indent=1, default=str) + "\n"

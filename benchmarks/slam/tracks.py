@@ -95,7 +95,6 @@ def _frames(line: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
 
 
 Alignment = Literal["origin", "se3", "none"]
-ALIGNMENTS = ("origin", "se3", "none")
 _TURNS = 3000  # of an estimate that tell its clock
 _SLACK = 1e-3  # s: a stamp this far outside the truth's span still counts as its end
 
@@ -110,6 +109,7 @@ class Track:
     true_position: Float[np.ndarray, "n 3"]  # True positions, m
     true_rotation: Rotation  # True attitudes, `n` of them
     covered: float  # Share of the truth's duration between the first and the last of these times
+    after: float  # Time for which the estimate goes on after the truth's end, s
     late: float | None = None  # By how much the turns show the estimate's clock to be late, s; from 10 ms on
 
     @property
@@ -128,10 +128,8 @@ def read_track(estimate: Path, truth: Path, alignment: Alignment = "origin") -> 
         alignment: See `align`.
 
     Raises:
-        BenchmarkError: A file is missing or wrong, they share fewer than two times, or there is no such alignment.
+        BenchmarkError: A file is missing or wrong, or they share fewer than two times.
     """
-    if alignment not in ALIGNMENTS:
-        raise BenchmarkError(f"no alignment {alignment!r}; there are {', '.join(ALIGNMENTS)}")
     try:
         both = load_tum(estimate), load_tum(truth)
     except RecordingError as error:
@@ -153,7 +151,8 @@ def _pair(estimated: Trajectory, true: Trajectory) -> Track:
     time = estimated.times[some]
     position, rotation = true.at(time)
     covered = float((time[-1] - time[0]) / (end - begin))
-    return Track(time, estimated.positions[some], estimated.rotations[some], position, rotation, min(covered, 1.0))
+    after, moved = max(0.0, float(estimated.times[-1] - end)), (estimated.positions[some], estimated.rotations[some])
+    return Track(time, *moved, position, rotation, min(covered, 1.0), after)
 
 
 def align(track: Track, alignment: Alignment) -> Track:

@@ -59,8 +59,8 @@ def doubt_layers(bore: Bore, cloud: Cloud) -> list[Warned]:
     return [Warned(
         Code.DOUBLED,
         f"{name_span(start, end)} the wall shows twice, up to {widest:.0f} cm apart, at "
-        f"{doubled[known].mean():.0%} of its places: two passes of the scan do not fit each other, or its poses "
-        "drifted; register them first: the wall that was built is neither",
+        f"{doubled[known].mean():.0%} of its places: two passes of the scan do not fit each other, its poses "
+        "drifted, or the odometry stood still; register them first: the wall that was built is neither",
         float(start), float(end),
     )]  # fmt: skip
 

@@ -64,7 +64,7 @@ class PoseCheck:
         """Sentence for the user; `None` where nothing is wrong."""
         if not self.blurred:
             return None
-        likely = self.cause or "the poses, their clock or the mount of the LiDAR may be wrong"
+        likely = self.cause or "poses, their clock or the LiDAR's mount may be wrong, or the odometry stood still"
         what, here, other, when = (
             ("the walls", self.thickness, self.expected, "where a single sweep has")
             if self.upright

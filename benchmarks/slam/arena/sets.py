@@ -42,7 +42,10 @@ COURSES: tuple[Course, ...] = (*_DIAL, *_SENSORS, *_DUST, *_MOTIONS, *_TEXTURES,
 
 @dataclass(frozen=True)
 class ArenaConfig:
-    """Settings of a set."""
+    """Records the arena: drives for LiDAR-inertial programs, from smooth walls to rough ones.
+
+    Example: python -m benchmarks.slam arena --jobs 2 --out out/arena
+    """
 
     out: Path  # Folder of the set: `recordings/` to hand out, `truth/` to keep.
     # Names of the recordings, as `walls-smooth`; by default all.
