@@ -104,14 +104,17 @@ _COLOURS = {
 _SHINY = {"rail_head", "galvanised"}
 
 
-def make_root(name: str) -> ET.Element:
-    """Return the root element with compiler, solver and view."""
+def make_root(name: str, bore: Bore) -> ET.Element:
+    """Return the root element with compiler, solver and view: a viewer opens before the portal and looks in."""
+    at = bore.axis.at(np.array([_start(bore)]))
+    heading = np.rad2deg(np.arctan2(at.tangent[0, 1], at.tangent[0, 0]))
     root = ET.Element("mujoco", model=name)
     ET.SubElement(root, "compiler", angle="radian", meshdir="meshes", texturedir="meshes", autolimits="true")
     ET.SubElement(root, "option", timestep="0.004", integrator="implicitfast", iterations="4", ls_iterations="8")
-    ET.SubElement(root, "statistic", extent="12")
+    ET.SubElement(root, "statistic", extent="12", center=format_numbers(at.position[0]))
     visual = ET.SubElement(root, "visual")
-    ET.SubElement(visual, "global", offwidth="1920", offheight="1080", fovy="60")
+    view = {"azimuth": f"{heading:.4g}", "elevation": "-8"}
+    ET.SubElement(visual, "global", offwidth="1920", offheight="1080", fovy="60", **view)
     ET.SubElement(visual, "quality", offsamples="4")
     ET.SubElement(visual, "headlight", ambient="0.28 0.28 0.29", diffuse="0.32 0.32 0.30", specular="0 0 0")
     ET.SubElement(visual, "map", znear="0.005", zfar="60", fogstart="1.5", fogend="14")
@@ -172,9 +175,13 @@ def add_cameras(world: ET.Element, bore: Bore, track: Track) -> None:
         ET.SubElement(world, "camera", name=name, pos=format_numbers(position), xyaxes=axes, fovy="65")
 
 
+def _start(bore: Bore) -> float:
+    return min(2.0, bore.length / 2)
+
+
 def add_rover(root: ET.Element, world: ET.Element, bore: Bore, track: Track, lidar_height: float) -> None:
     """Adds the rover with its motors, 2 m into the bore; its LiDAR is `lidar_height` above the sleepers, m."""
-    at = bore.axis.at(np.array([min(2.0, bore.length / 2)]))
+    at = bore.axis.at(np.array([_start(bore)]))
     elevation = float(np.interp(at.station[0], bore.station, track.elevation))
     yaw = Rotation.from_euler("z", np.arctan2(at.tangent[0, 1], at.tangent[0, 0]))
     for part in rover.rover_mjcf(lidar_height):
@@ -219,7 +226,7 @@ def write_scene(
     With furniture the file is `scene_furnished.xml`. It shares the meshes that a call without furniture has written
     into the same folder. `walls` are those at the LiDAR's height.
     """
-    root = make_root(name)
+    root = make_root(name, bore)
     parts = SceneParts(ET.SubElement(root, "asset"), ET.SubElement(root, "worldbody"), folder / "meshes")
     parts.meshes.mkdir(exist_ok=True)
     world = parts.world

@@ -72,6 +72,8 @@ def test_the_rover_stands_then_drives_two_metres_and_turns(scene):
     mujoco.mj_step(model, data, 250)
     assert np.abs(data.qvel).max() < 0.05
     start, ahead = data.qpos[:3].copy(), data.body("scout").xmat.reshape(3, 3)[:, 0].copy()
+    assert np.linalg.norm(model.stat.center[:2] - start[:2]) < 0.05, "a viewer looks at it, from behind"
+    assert np.cos(np.radians(model.vis.global_.azimuth) - np.arctan2(ahead[1], ahead[0])) > 0.999
     data.ctrl[:] = (1.0, 0.0)
     mujoco.mj_step(model, data, 560)
     driven = data.qpos[:3] - start
