@@ -28,7 +28,6 @@ _POINTS = 6_000  # of a sweep
 _WARM_UP = 8  # sweeps that are left out: the map is too thin for them
 _REACH, _COARSE, _STEP = 1.5, 0.02, 0.005  # s: largest lag that is tried, and between two lags, far and near
 _LIKELY, _AGREE = 0.5, 0.85  # correlations of turn rates from which a lag is looked at closely, and counts
-_FOREIGN = 0.8  # up to which they are those of another drive
 _AS_KNOWN = 0.95  # of the agreement after the best rotation, with which mounts are as they are known
 _LIVELY = 0.03  # rad/s, mean size less the mean; a carrier that turns more evenly tells no lag
 _LONGEST = 3.0  # times the median size
@@ -179,7 +178,7 @@ class Clock:
     @property
     def words(self) -> str | None:
         """Sentence for the user; `None` where nothing is wrong, or no longer."""
-        if self.offset is None and self.agreement < _FOREIGN:
+        if self.offset is None and self.agreement < _AGREE:
             return (
                 f"the turns of {self.of} are not those of the LiDAR (correlation {self.agreement:.2f}): it is of "
                 f"another drive, or more than {_REACH:g} s off"

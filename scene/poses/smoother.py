@@ -92,21 +92,19 @@ def _turn_chain(chain: Chain, lever: np.ndarray, yaw: float) -> Chain:
 
 
 def _first_knots(problem: Problem, chain: Chain, n: int) -> tuple[Problem, Chain]:
-    """Return the first `n` knots and what was measured between them."""
-    motion, seen, steps = problem.motion, problem.sightings, problem.steps
+    """Return the first `n` knots and what IMU and control measured between them."""
+    motion, short = _part_of(problem.motion, chain, slice(0, n))
+    seen = problem.sightings
     near = seen.knot < n - 1
-    if steps is not None:
-        inside = steps.second < n
-        fields = (steps.first, steps.second, steps.turn, steps.shift, steps.turn_root, steps.shift_root)
-        steps = Steps(*(values[inside] for values in fields))
-    short = replace(
-        problem,
-        motion=replace(motion, rate=motion.rate[: n - 1], force=motion.force[: n - 1]),
-        sightings=replace(seen, knot=seen.knot[near], share=seen.share[near], position=seen.position[near]),
-        steps=steps,
-    )
-    state = (chain.attitude, chain.position, chain.velocity, chain.gyro_bias, chain.accel_bias)
-    return short, Chain(chain.times[:n], *(values[:n] for values in state))
+    seen = replace(seen, knot=seen.knot[near], share=seen.share[near], position=seen.position[near])
+    return replace(problem, motion=motion, sightings=seen), short
+
+
+def _part_of(motion: Motion, chain: Chain, part: slice) -> tuple[Motion, Chain]:
+    """Return some knots, and what an IMU measured between them."""
+    short = Chain(*(values[part] for values in astuple(chain)))
+    between = slice(part.start, part.start + len(short.times) - 1)
+    return replace(motion, rate=motion.rate[between], force=motion.force[between]), short
 
 
 _LAG_TIME = 20.0  # s of the recording, about its middle, by which the lag of a control is found
@@ -123,10 +121,7 @@ def find_control_lag(problem: Problem, chain: Chain, control: Control) -> float 
     `chain` is the solution with the control as it is. `None` where the motion does not tell.
     """
     middle, half = len(chain.times) // 2, round(0.5 * _LAG_TIME / _KNOT_STEP)
-    part = slice(max(middle - half, 0), middle + half + 1)
-    short = Chain(*(values[part] for values in astuple(chain)))
-    between = slice(part.start, part.start + len(short.times) - 1)
-    motion = replace(problem.motion, rate=problem.motion.rate[between], force=problem.motion.force[between])
+    motion, short = _part_of(problem.motion, chain, slice(max(middle - half, 0), middle + half + 1))
     inside = np.abs(control.times - short.times[[0, -1]].mean()) < 0.5 * np.ptp(short.times) - _FARTHEST - 2 * _LAG_STEP
     rows = replace(control, times=control.times[inside], positions=control.positions[inside])
     if len(rows.times) < MIN_CONTROL_ROWS:
