@@ -113,8 +113,8 @@ def make_root(name: str, bore: Bore) -> ET.Element:
     ET.SubElement(root, "option", timestep="0.004", integrator="implicitfast", iterations="4", ls_iterations="8")
     ET.SubElement(root, "statistic", extent="12", center=format_numbers(at.position[0]))
     visual = ET.SubElement(root, "visual")
-    view = {"azimuth": f"{heading:.4g}", "elevation": "-8"}
-    ET.SubElement(visual, "global", offwidth="1920", offheight="1080", fovy="60", **view)
+    azimuth = f"{heading:.4g}"
+    ET.SubElement(visual, "global", offwidth="1920", offheight="1080", fovy="60", azimuth=azimuth, elevation="-8")
     ET.SubElement(visual, "quality", offsamples="4")
     ET.SubElement(visual, "headlight", ambient="0.28 0.28 0.29", diffuse="0.32 0.32 0.30", specular="0 0 0")
     ET.SubElement(visual, "map", znear="0.005", zfar="60", fogstart="1.5", fogend="14")
