@@ -1,5 +1,6 @@
 """Scans and poses to one cloud: every return moved from the pose at its own time."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,22 +54,27 @@ def register_scans(
     thinned, low, batch = VoxelMean(voxel), [np.empty((0, 3))], list[np.ndarray]()
     placed, uncovered, every = 0, 0, 1
     begin, end = np.inf, -np.inf
-    for scan in recording.scans():
-        stage.advance()
-        begin, end = min(begin, scan.stamp), max(end, scan.end)
-        if not trajectory.covers(scan.stamp, scan.end):
-            uncovered += 1
-            continue
-        points = deskew(scan, trajectory)
-        batch.append(np.column_stack([points, np.nan * scan.times if scan.intensity is None else scan.intensity]))
-        placed += 1
-        if placed % every == 0:
-            low.append(_low_returns(scan, points, trajectory))
-        if len(batch) == _BATCH:
-            thinned.add(np.concatenate(batch))
-            if placed == _BATCH:
-                every = _choose_every(thinned.returns / _BATCH * recording.scan_count, trajectory)
-            batch = []
+    with ThreadPoolExecutor(1) as second:  # one batch is thinned while the next is read
+        thinning = second.submit(lambda: None)
+        for scan in recording.scans():
+            stage.advance()
+            begin, end = min(begin, scan.stamp), max(end, scan.end)
+            if not trajectory.covers(scan.stamp, scan.end):
+                uncovered += 1
+                continue
+            points = deskew(scan, trajectory)
+            batch.append(np.column_stack([points, np.nan * scan.times if scan.intensity is None else scan.intensity]))
+            placed += 1
+            if placed % every == 0:
+                low.append(_low_returns(scan, points, trajectory))
+            if len(batch) == _BATCH:
+                thinning.result()
+                thinning = second.submit(thinned.add, np.concatenate(batch))
+                if placed == _BATCH:
+                    thinning.result()
+                    every = _choose_every(thinned.returns / _BATCH * recording.scan_count, trajectory)
+                batch = []
+        thinning.result()
     if batch:
         thinned.add(np.concatenate(batch))
     if uncovered > most_uncovered * max(recording.scan_count, 1):
