@@ -143,17 +143,18 @@ def reconstruct(
     with _naming(source):
         if kind == "rings":
             return _fit_rings(path, config, progress)
+        placed = load_kept(kept) if kept is not None and kind == "recording" else None
         if kind == "cloud":
-            return _fit_cloud(place_cloud(path, *parts), config, progress)
-        placed = None if kept is None else load_kept(kept)
-        if placed is None:
+            placed = place_cloud(path, *parts)
+        elif placed is None:
             placed = place_recording(path, trajectory, control, calibration, *parts, more)
             if kept is not None:
                 keep_placed(kept, placed)
         try:
             return _fit_cloud(placed, config, progress)
-        except FitError as error:  # what no bore can be fitted to follows from poses that are in doubt
-            if doubt := placed.facts.get("clock_doubt") or placed.facts.get("pose_doubt"):
+        except FitError as error:  # what no bore can be fitted to follows from a unit or poses that are in doubt
+            doubts = [placed.facts.get(f"{of}_doubt") for of in ("unit", "clock", "pose")]
+            if doubt := next(filter(None, doubts), None):
                 raise error.about(f"{doubt}; no bore can be fitted to them ({error})") from error
             raise
 

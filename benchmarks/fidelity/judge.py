@@ -125,9 +125,9 @@ def open_values(case: Case, folder: Path, processes: int = 1) -> Iterator[dict[s
         keep(tuple(names))
 
 
-# Halves of about the same time, with the stated faults that the first process puts in as well: what beams derive serves
-# the first, what the bore derives the second. The first alone has the recording that the builder read.
-FIRST_HALF = ("CEN", "SEC", "C2M", "CMP", "BEA", "DIS", "SCN", "PAR", "DEG")
+# Halves of about the same time, with the stated faults that the first process puts in as well: what beams and sections
+# derive serves the first, what meshes and ground derive the second. The first alone has the builder's recording.
+FIRST_HALF = ("CEN", "SEC", "C2M", "CMP", "BEA", "DIS", "OCC", "LIN", "SCN", "PAR", "DEG")
 SECOND_HALF = tuple(name for name in table.CATEGORIES if name not in FIRST_HALF)
 
 

@@ -34,6 +34,15 @@ def connected_groups(count: int, pairs: Int[np.ndarray, "k 2"]) -> Int[np.ndarra
     return np.asarray(connected_components(graph, directed=False)[1])
 
 
+def count_edges(
+    mesh: trimesh.Trimesh,
+) -> tuple[Int[np.ndarray, "e 2"], Int[np.ndarray, " e"], Int[np.ndarray, " k"]]:
+    """Return the vertex numbers of each edge, in order, its faces, and the edge of each row of `edges_sorted`."""
+    size = max(len(mesh.vertices), 1)
+    key, edge, count = np.unique(mesh.edges_sorted @ [size, 1], return_inverse=True, return_counts=True)
+    return np.column_stack(np.divmod(key, size)), count, edge
+
+
 def find_bodies(mesh: trimesh.Trimesh) -> tuple[Int[np.ndarray, " v"], Float[np.ndarray, "b 3"]]:
     """Return the number of the body of each vertex, and the middle of each body, m."""
     count = len(mesh.vertices)

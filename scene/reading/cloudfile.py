@@ -62,7 +62,7 @@ def _crs_beside(path: Path) -> str | None:
 
 def _frame_of(path: Path, source: CloudSource, config: ReadingConfig) -> Frame:
     """Chooses unit and axes of a cloud; raises `RecordingError` for a flag or declaration that is none."""
-    local = next(source.chunks(), None) if config.unit is None and needs_local_points(source) else None
+    local = next(source.chunks(), None) if needs_local_points(source) else None
     local = None if local is None else local[:, :3]
     whole = source.sample if len(source.sample) or local is None else local
     try:

@@ -174,6 +174,7 @@ _MM_FROM = 500.0
 _NOT_SURELY_M = 50.0  # least extent from which the heights of columns are asked
 _CM_FROM, _MM_HEIGHT_FROM = 50.0, 1600.0  # heights of columns: tunnels are some 5 m high, 500 cm or 5000 mm
 _IN_COLUMN = 60  # points
+_OTHER_UNIT = 5.0  # ratio from which a flag's unit is not the one detected: feet look like metres
 _LYING = 3.0  # a tunnel longer along "up" than this many times both other extents is not z up
 _LYING_LENGTH = 30.0  # m
 _Y_UP = "x-zy"
@@ -185,7 +186,8 @@ class Frame:
 
     unit: str  # A key of `UNITS`
     axes: str  # Stored axes that point along x, y and z
-    facts: dict[str, str]  # Both, and how each was found, for people and the manifest
+    # Both, and how each was found, for people and the manifest; `unit_doubt` where a flag's unit is not what it looks
+    facts: dict[str, str]
 
     def apply(self, points: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
         """Return stored coordinates in m, z up; further columns stay as they are."""
@@ -268,7 +270,12 @@ def choose_frame(
     why = "by flag" if axes else "detected: longest along z, so y is taken as up" if lying else "by default, z up"
     if np.linalg.det(np.eye(3)[_parse_axes(order)[0]] * _parse_axes(order)[1][:, None]) < 0:
         why += ", mirrored"
-    return Frame(chosen, order, {"unit": f"{chosen} ({how})", "axes": f"{order} ({why})"})
+    facts = {"unit": f"{chosen} ({how})", "axes": f"{order} ({why})"}
+    if unit and len(finite) and not 1 / _OTHER_UNIT < UNITS[unit] / UNITS[detected] < _OTHER_UNIT:
+        facts["unit_doubt"] = (
+            f"--unit {unit}, but with a least extent of {extent.min():.4g} its points look like {detected}"
+        )
+    return Frame(chosen, order, facts)
 
 
 def _parse_axes(axes: str) -> tuple[list[int], np.ndarray]:

@@ -64,6 +64,18 @@ def test_cm_and_mm_are_told_by_the_height_of_the_bore_even_where_a_file_says_met
     np.testing.assert_allclose(np.ptp(cloud.points, axis=0), np.ptp(KNOWN.points, axis=0), atol=0.15)
 
 
+@pytest.mark.parametrize(
+    ("unit", "scale", "doubted"), [("mm", 1, "m"), ("m", 1000, "mm"), ("cm", 100, ""), ("ft", 1, "")]
+)
+def test_a_unit_by_flag_that_the_cloud_contradicts_is_named_where_no_bore_can_be_fitted(tmp_path, unit, scale, doubted):
+    path = write_ply(tmp_path / "a.ply", KNOWN.points[::4] * scale)
+    assert ("unit_doubt" in read_cloud(path, 0.04, ReadingConfig(unit=unit))[1]) == bool(doubted)
+    if doubted:
+        reading = ReconstructConfig(reading=ReadingConfig(unit=unit))
+        with pytest.raises(FitError, match=rf"a\.ply: --unit {unit}, but .* its points look like {doubted}; no bore"):
+            reconstruct(path, None, reading, Stages())
+
+
 def test_a_long_climbing_tunnel_in_metres_is_no_tunnel_in_cm(tmp_path):
     """700 m by 700 m in plan, 600 m in height: no extent tells the unit, the height of its columns does."""
     rng = np.random.default_rng(0)

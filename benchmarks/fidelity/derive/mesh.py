@@ -12,7 +12,7 @@ from benchmarks.fidelity.case import Case, kept_until, per_case, per_reference
 from benchmarks.fidelity.derive.axis import hold_curve
 from benchmarks.fidelity.derive.curve import Curve, candidate_curve, interpolate_rows, truth_curve
 from benchmarks.fidelity.derive.surface import sample_surface, surface_caster, visible_surface
-from benchmarks.fidelity.meshes import connected_groups
+from benchmarks.fidelity.meshes import connected_groups, count_edges
 
 _WELD_DIGITS = 6  # a format with float32 keeps corners together and moves them by less
 _MOUTH_RIM = 0.15  # m from the plane of a mouth: its rim need not be cut straight
@@ -46,7 +46,7 @@ def is_sound(mesh: trimesh.Trimesh) -> bool:
 
 
 def mesh_edges(mesh: trimesh.Trimesh) -> Edges:
-    ends, count = np.unique(mesh.edges_sorted, axis=0, return_counts=True)
+    ends, count, _ = count_edges(mesh)
     return Edges(ends, count, np.linalg.norm(mesh.vertices[ends[:, 0]] - mesh.vertices[ends[:, 1]], axis=1))
 
 
@@ -83,10 +83,10 @@ def mouth_vertices(case: Case) -> Bool[np.ndarray, " v"]:
 
 def face_parts(mesh: trimesh.Trimesh) -> Int[np.ndarray, " f"]:
     """Return the number of the component of each face; faces that share an edge belong together."""
-    ends, edge = np.unique(mesh.edges_sorted, axis=0, return_inverse=True)
+    ends, _, edge = count_edges(mesh)
     count = len(mesh.faces)
     face = mesh.edges_face
-    group = connected_groups(count + len(ends), np.column_stack([face, count + edge.ravel()]))
+    group = connected_groups(count + len(ends), np.column_stack([face, count + edge]))
     return np.unique(group[:count], return_inverse=True)[1]
 
 

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from benchmarks.fidelity.candidate import Candidate
 from benchmarks.fidelity.derive.curve import interpolate_rows
 from benchmarks.fidelity.faults.kinds import Fault, Site, fault_kind
-from benchmarks.fidelity.meshes import concatenate_meshes, without_faces
+from benchmarks.fidelity.meshes import concatenate_meshes, count_edges, without_faces
 from subterra_jax.host.tunnelfile import read_fields
 
 PANELS = ("wall_", "bed_")
@@ -335,7 +335,7 @@ def add_pillars(site: Site, fault: Fault) -> Candidate:
 def close_mouth(site: Site, fault: Fault) -> Candidate:
     lining, bore = site.candidate.lining.copy(), site.candidate.bore
     lining.merge_vertices(digits_vertex=6)
-    edges, count = np.unique(lining.edges_sorted, axis=0, return_counts=True)
+    edges, count, _ = count_edges(lining)
     rim = edges[count == 1]
     middle = lining.vertices[rim].mean(axis=1)
     near = np.abs((middle - bore.position[-1]) @ bore.tangent[-1]) < 0.3
