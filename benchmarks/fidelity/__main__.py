@@ -19,7 +19,6 @@ from benchmarks.fidelity.faults.runner import Bench, is_bold, judge_outcomes, li
 from benchmarks.fidelity.files import FidelityError, read_kept, write_csv, write_json
 from benchmarks.fidelity.inputs import Inputs, SplitConfig, complete_inputs, foreign_scene, read_case, split_recording
 from benchmarks.fidelity.judge import Judgement
-from benchmarks.fidelity.leaks import find_leaks
 from benchmarks.fidelity.report import write_report
 from scene.errors import require_input
 from subterra_jax.host.command import parse, run_command
@@ -184,10 +183,9 @@ def _write_report(opened: OpenCase) -> dict[str, Any]:
     inputs, folder = opened.inputs, opened.inputs.out
     key = case_hash(opened.case)
     rows = read_kept(folder / "controls.json", CONTROLS_SCHEMA, key).get("rows")
-    leaks = find_leaks(opened.case, opened.judgement.values["base"])
-    judgement = judge.make_judgement(opened.judgement.values, leaks, rows, opened.judgement.windows)
-    judgement = judge.add_outside(judgement, opened.case)
-    return write_report(folder, opened.case, inputs, judgement, rows)
+    judged = opened.judgement
+    judgement = judge.make_judgement(judged.values, judged.leaks, rows, judged.windows)
+    return write_report(folder, opened.case, inputs, judge.add_outside(judgement, opened.case), rows)
 
 
 def _print_summary(report: dict[str, Any]) -> None:
