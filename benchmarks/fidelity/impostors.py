@@ -33,7 +33,8 @@ def null_tube(candidate: Candidate, sleepers: bool = True) -> Candidate:
         ring_station=bore.ring_station[:0],
         pocket=bore.pocket[:0],
     )
-    track = candidate.track if sleepers else no_track()
+    none, rails = np.zeros((0, 3)), trimesh.Trimesh()
+    track = candidate.track if sleepers else Track(none, rails, {"left": none, "right": none}, rails, rails)
     name = f"{candidate.name} as null tube" + ("" if sleepers else " without track")
     return replace(
         candidate, name=name, lining=lining, solid=solid, bore=constant, track=track, extra=trimesh.Trimesh(),
@@ -70,11 +71,6 @@ def sweep_section(
     if solid.volume < 0.0:
         solid.faces, lining.faces = solid.faces[:, ::-1], lining.faces[:, ::-1]
     return lining, solid
-
-
-def no_track() -> Track:
-    none = {"left": np.zeros((0, 3)), "right": np.zeros((0, 3))}
-    return Track(np.zeros((0, 3)), trimesh.Trimesh(), none, trimesh.Trimesh(), trimesh.Trimesh())
 
 
 def _fan(ring: np.ndarray, middle: int, reverse: bool) -> np.ndarray:

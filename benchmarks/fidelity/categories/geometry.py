@@ -231,14 +231,11 @@ def lin_pocket_count_rel_err(case: Case) -> Value:
     return number(100.0 * abs(len(judged) / len(reference) - 1.0), len(reference))
 
 
-def _median_absolute(errors: np.ndarray) -> float:
-    return float(np.median(np.abs(errors)))
-
-
 @metric("lin_pocket_depth_bias", "LIN", D(0.00262, 0.08), "m", needs="reference", of=mean_magnitude, args=("depth",))
 @metric("lin_pocket_depth_mae", "LIN", D(0.00324, 0.08), "m", gate=True, needs="reference",
         of=mean_absolute, args=("depth",))  # fmt: skip
-@metric("lin_pocket_area_rel_err", "LIN", D(12.2, 60), "%", needs="reference", of=_median_absolute, args=("area",))
+@metric("lin_pocket_area_rel_err", "LIN", D(12.2, 60), "%", needs="reference",
+        of=lambda errors: float(np.median(np.abs(errors))), args=("area",))  # fmt: skip
 def matched_pocket_error(case: Case, name: str) -> Value | Samples:
     """Error of depth (m) or area (%) of the matched pockets."""
     if not len(lining.reference_pockets(case)):

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 from jaxtyping import Bool, Float
-from scipy.ndimage import binary_dilation, binary_erosion, binary_opening, distance_transform_edt
+from scipy.ndimage import binary_dilation, binary_opening, distance_transform_edt
 from skimage.morphology import skeletonize
 
 from benchmarks.fidelity.case import Case, per_case
@@ -106,11 +106,6 @@ def _wall_distances(local: Float[np.ndarray, "k 3"], both: Plane) -> Float[np.nd
         kept = (spread >= 0) & (spread < rows)
         wall[side] = grouped_median(spread[kept], value[kept], rows, _LEAST_RETURNS)
     return wall
-
-
-def edge_cells(free: Bool[np.ndarray, "n m"]) -> Bool[np.ndarray, "n m"]:
-    """Return the free cells beside cells that are not free; the mouths are open."""
-    return free & ~binary_erosion(np.pad(free, ((1, 1), (0, 0)), mode="edge"))[1:-1]
 
 
 def cell_distances(from_cells: Bool[np.ndarray, "n m"], to: Bool[np.ndarray, "n m"], edge: float) -> np.ndarray:

@@ -116,7 +116,9 @@ def run_control(bench: Bench, job: Job) -> Outcome:
     with tempfile.TemporaryDirectory() as scratch:
         site = Site(replace(bench.case, cache={}), rng, Path(scratch), partial(_foreign_candidate, bench))
         corrupted = put_in(site, control.faults[job.dose])
-        values = bench.compute(corrupted, _evaluated_categories(control.evaluated), bench.base)
+        known = {"all": None, kinds.OUT_OF_SCENE: judge.geometry_categories()}
+        chosen = known.get(control.evaluated, tuple(control.evaluated.split()))
+        values = bench.compute(corrupted, chosen, bench.base)
         recorded = None if bench.case.hold is None else bench.case.hold.hash
         return Outcome(job, values, find_leaks(corrupted, values, recorded))
 
@@ -124,12 +126,6 @@ def run_control(bench: Bench, job: Job) -> Outcome:
 def without_figures(reasons: list[str]) -> set[str]:
     """Return reasons without their figures, so that those of two candidates can be compared."""
     return {re.sub(r"(?<![\w.])-?\d[\d.e-]*(?!\w)", "#", reason) for reason in reasons}
-
-
-def _evaluated_categories(evaluated: str) -> tuple[str, ...] | None:
-    if evaluated == "all":
-        return None
-    return judge.geometry_categories() if evaluated == kinds.OUT_OF_SCENE else tuple(evaluated.split())
 
 
 def _foreign_candidate(bench: Bench) -> Candidate:
