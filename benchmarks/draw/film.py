@@ -78,7 +78,7 @@ def run(config: FilmConfig) -> None:
         config.out,
         film(drawn, radius, f"{find(config.task, short=True).split('/')[-1]}, driven by {name}", config.pictures, view),
     )
-    print(f"{config.out}: {drawn.trace.time[-1]:.0f} s of driving, {_end(drawn)}")
+    print(f"{config.out}: {drawn.trace.time[-1]:.0f} s of driving, {drawn.trace.ended}")
 
 
 def drive_episode(config: FilmConfig) -> tuple[Drawn, float, View | None]:
@@ -140,10 +140,6 @@ def film(drawn: Drawn, radius: float, title: str, pictures: int, view: View | No
     return buffer.getvalue()
 
 
-def _end(drawn: Drawn) -> str:
-    return "success" if drawn.trace.success else "contact" if drawn.trace.contact else "no success"
-
-
 def _pictures(drawn: Drawn, radius: float, title: str, count: int, view: View | None) -> Iterator[np.ndarray]:
     heights, size = ((1.55, 1.0), 4.6) if view is None else ((3.6, 1.55, 1.0), 8.6)
     figure, (*above, plan, strip) = plt.subplots(
@@ -190,7 +186,7 @@ def _plan(axes: Axes, drawn: Drawn, radius: float) -> Any:
         hits.set_data(*ends.T)
         front = turn.transform((2.0 * radius, 0.0))
         nose.set_data([0.0, front[0]], [0.0, front[1]])
-        over = f": {_end(drawn)}" if row == len(drawn) - 1 else ""
+        over = f": {drawn.trace.ended}" if row == len(drawn) - 1 else ""
         text.set_text(f"station {station[row]:.1f} m{goal}{over}")
 
     return show

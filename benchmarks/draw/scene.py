@@ -9,7 +9,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 from benchmarks.command import BenchmarkError, require_least
-from subterra_jax.host.files import require_file
+from subterra_jax.host.files import replace_file, require_file
 from subterra_jax.pictures.renderer import import_mujoco, light_near, open_renderer
 
 _LOOK_AHEAD = 8.0  # m
@@ -99,4 +99,6 @@ def run(config: RenderConfig) -> None:
     if config.at is not None:
         ahead = np.array(config.ahead) / max(float(np.linalg.norm(config.ahead)), 1e-9)
         camera = Pose(np.array(config.at), ahead, float(np.deg2rad(config.fov_deg)), config.width, config.height)
-    Image.fromarray(picture(config.scene, camera, config.width, config.height)).save(config.out)
+    pixels = picture(config.scene, camera, config.width, config.height)
+    with replace_file(config.out) as path:
+        Image.fromarray(pixels).save(path, format="PNG")

@@ -25,8 +25,7 @@ def main(arguments: list[str] | None = None) -> int:
             arguments,
         )
         trace = record(config)
-        ended = "success" if trace.success else "contact" if trace.contact else "no success"
-        print(f"{len(trace.command)} steps, {ended}: {config.recording_folder}, {config.truth_folder}")
+        print(f"{len(trace)} steps, {trace.ended}: {config.recording_folder}, {config.truth_folder}")
 
     return run_command(act, "interrupted: nothing was written")
 

@@ -40,9 +40,16 @@ class Trace:
     period: float  # control period, s
     success: bool = False  # the task was achieved
     contact: bool = False  # the episode ended at a wall or an obstacle
+    over: bool = False  # the episode ended, and was not cut after the steps that were asked for
 
     def __len__(self) -> int:
         return len(self.action)
+
+    @property
+    def ended(self) -> str:
+        """How it ended, in words."""
+        ended = "success" if self.success else "contact" if self.contact else "no success"
+        return ended if self.over else f"cut after {len(self)} steps"
 
     @property
     def time(self) -> Float[np.ndarray, "rows"]:
@@ -83,6 +90,7 @@ def drive(
             n = min(int(np.argmax(over)) + 1 if over.any() else chunk, left)
             end = jax.tree.map(lambda leaf, n=n: leaf[n - 1], (after, noise))
             ends: dict[str, Any] = {name: bool(rows.pop(name)[n - 1]) for name in ("success", "contact")}
+            ends["over"] = bool(over[:n].any())
             rows["pose"] = legs.take(chunk)
             observed = [trace.observation[:-1], rows.pop("observation")[:n], _look(env, params, *end)[None]]
             series: dict[str, Any] = {

@@ -100,8 +100,7 @@ def view(settings: argparse.Namespace) -> None:
     }
     shapes = planar_shapes(shown, settings.lining or plan.default_lining)
     write_page(out, draw(env, params, shown, trace), shapes, float(params.vehicle.radius), facts)
-    ended = "success" if trace.success else "contact" if trace.contact else "no success"
-    print(f"{len(trace)} steps, {ended}: {out}")
+    print(f"{len(trace)} steps, {trace.ended}: {out}")
     if settings.open:
         webbrowser.open(out.resolve().as_uri())
 

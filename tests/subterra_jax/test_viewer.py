@@ -33,7 +33,7 @@ def straight(centreline, n=21, **changes):
     x, zero = 0.2 * np.arange(n), np.zeros(n)
     state = SimpleNamespace(station=x)
     cloud, pose = np.zeros((n, 0, 3)), np.zeros((n, 0, 19))
-    trace = SimpleNamespace(state=state, cloud=cloud, pose=pose, period=0.1, success=True, contact=False, time=0.1 * x)
+    trace = SimpleNamespace(state=state, cloud=cloud, pose=pose, period=0.1, ended="success", time=0.1 * x)
     fields = {
         "centreline": centreline,
         "trace": trace,
@@ -197,5 +197,5 @@ def test_what_a_lidar_in_three_dimensions_sees_is_drawn_about_the_robot(task):
 def test_the_command_writes_a_page(monkeypatch, tmp_path, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["--task", "TraverseShort", "--tunnel", "control", "--steps", "5", "--out", "a.html"]) == 0
-    assert "5 steps, no success: a.html" in capsys.readouterr().out
+    assert "5 steps, cut after 5 steps: a.html" in capsys.readouterr().out
     assert played(tmp_path / "a.html")[1]["durationSeconds"] == pytest.approx(0.5, abs=0.1)
