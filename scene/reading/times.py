@@ -184,11 +184,10 @@ def _unwrap(values: Shaped[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], 
     times = values.astype(np.float64)
     good = np.isfinite(times)
     if _counts_32(values) and len(values):
-        ahead = times - np.median(times)
-        early, late = ahead < -0.5 * _COUNTER, ahead > 0.5 * _COUNTER
-        across = early | late
+        turns = np.rint((times - np.median(times)) / _COUNTER)
+        across = turns != 0.0
         if across.any() and times[across].std() > _LIKE * across.mean() * times[~across].std():
-            times = times + _COUNTER * early - _COUNTER * late
+            times = times - _COUNTER * turns
         else:
             good = ~across
     return times, good

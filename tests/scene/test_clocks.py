@@ -50,6 +50,12 @@ def test_a_lag_is_found_whatever_the_mount(lidar, late):
         assert found - same == pytest.approx(late, abs=1e-3), "as precise between the lags that are tried"
 
 
+def test_an_axis_that_the_lidar_hardly_sees_counts_little(lidar):
+    off = np.random.default_rng(2).normal(0, 0.3, len(lidar.rate))
+    blind = LidarTurns(lidar.start, lidar.end, lidar.rate + np.outer(off, [0.0, 1.0, 0.0]))
+    assert find_lag(blind, turns_of_gyro(gyro(0.1, Rotation.identity())))[0] == pytest.approx(0.1, abs=0.003)
+
+
 def test_a_carrier_that_hardly_turns_tells_no_lag(lidar):
     turns = turns_of_gyro(gyro(0.1, Rotation.identity()))
     calm = LidarTurns(lidar.start, lidar.end, 0.02 * lidar.rate)
