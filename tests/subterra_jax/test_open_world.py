@@ -260,7 +260,7 @@ def test_the_plan_of_every_kind_is_the_cut_of_its_shell(kind, variant):
     error = check_cut(kind, variant, 70.0)
     rounds = variant != "smooth" and kind in ("sprayed", "rock")
     assert np.median(error) < (0.006 if rounds else 0.002)
-    assert np.mean(error > 0.02) < (0.12 if rounds else 0.05)
+    assert np.mean(error > 0.02) < (0.15 if rounds else 0.05)
 
 
 def hostile(names: list[str], n_envs: int, n_steps: int) -> None:
