@@ -45,7 +45,7 @@ def meet(
         relief: Surface of the bore, or of one picked from a stack.
         origins: Origins, one for each ray or one for an image, tunnel frame, m, within 2 m of the station.
         directions: Unit vectors, tunnel frame, `(n, 3)`, or an image, a ring a row; see `beams`.
-            NVIDIA GPUs take an image column by column, which was twice as fast in upright tunnels.
+            NVIDIA GPUs take an image tile by tile, which was twice as fast in upright tunnels.
         station: Station of the origins, m.
         limits: Largest ranges, m.
 

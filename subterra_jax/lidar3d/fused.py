@@ -90,7 +90,7 @@ def _kernel(*refs: Any, image: tuple[int, int] | None) -> None:
 def _tile(image: tuple[int, int]) -> tuple[int, int]:
     """Return the rows and columns of a tile of 32 rays: columns are near one another in images with many of them."""
     fits = [k for k in (1, 2, 4, 8, 16, 32) if image[0] % k == 0 and image[1] % (ROWS // k) == 0]
-    tall = max((k for k in fits if k <= (16 if image[1] < 512 else 8)), default=fits[0])
+    tall = max((k for k in fits if k <= (16 if image[1] < 512 else 4)), default=fits[0])
     return tall, ROWS // tall
 
 

@@ -259,7 +259,7 @@ class SpatialLidar(Part):
         return Met(met.ranges[:n], normal, met.thing[:n]), cosine, rays, origins[:n]
 
     def _meet(self, origins: Array, rays: Array, sensing: SensingState, params: EnvParams) -> Met:
-        """Return what rays meet; those of one place as an image, which GPUs take column by column."""
+        """Return what rays meet; those of one place as an image, which GPUs take tile by tile."""
         sensor, relief = params.lidar, self.relief(sensing, params)
         limit = jnp.asarray(sensor.range_max, jnp.float32)
         if sensor.sweep:

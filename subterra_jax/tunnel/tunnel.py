@@ -23,7 +23,7 @@ GROUP = 16  # blocks that a CPU looks at together; there are twice as many of pa
 WIDTH = 16  # segments that a CPU looks at together
 BLOCK_LENGTH, MOST_SEGMENTS = 2.0, 16  # of a block of wall: m, about; they affect speed alone
 # Boxes sorted by where a beam enters them; speed alone. Beside furniture it enters more without touching what is there.
-_CANDIDATES, _CANDIDATES_FURNISHED = 3, 5
+_CANDIDATES, _CANDIDATES_FURNISHED = 4, 5
 # What a stack has of each of its tunnels.
 _NUMBERS = ("length", "spacing", "ring_pitch", "first_node", "n_nodes", "texture")
 
