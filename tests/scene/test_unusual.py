@@ -75,6 +75,9 @@ RECORDINGS = {
         lambda k: (100.0 if k < 20 else 3.0) + 0.1 * k + SINCE, said="and otherwise 1 times", count=40),
     "clock that runs away from the headers": seconds(
         lambda k: 500.0 + 0.1003 * k + SINCE, said="by another clock, s", count=40),
+    "headers that come late by chance": Sweeps(
+        times=lambda k, s: 500.0 + 0.1 * k + SINCE, header=lambda k, s: s + 0.04 * (k % 7 == 3), count=40,
+        said="by another clock, s"),
     "time of a simulation, from zero": Sweeps(
         header=lambda k, s: 0.1 * k, said="s after the stamp"),
     "a few times that are no number": Sweeps(times=lambda k, s: np.where(np.arange(RAYS) % 50 == 7, np.nan, SINCE)),

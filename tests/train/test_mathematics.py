@@ -107,18 +107,30 @@ def test_discounted_returns_begin_anew_with_every_episode_and_go_on_between_unro
     np.testing.assert_allclose(after, [0.0])
 
 
+ALONG = TrainConfig(memory="along", auxiliary=True, drives=2, steps=10 * 128 * 64)
+ROVER = SimpleNamespace(vehicle=SimpleNamespace(period=0.1, speed_max=2.0))
+
+
 def test_the_localiser_learns_ever_more_slowly_down_to_a_fiftieth(monkeypatch):
-    config = TrainConfig(memory="along", auxiliary=True, drives=2, steps=10 * 128 * 64)
-    params = SimpleNamespace(vehicle=SimpleNamespace(period=0.1, speed_max=2.0))
-    learner = localiser.LocaliserLearner(None, params, config)
+    learner = localiser.LocaliserLearner(None, ROVER, ALONG)
     up = lambda weights, part: ((jnp.zeros(()), {}), jax.tree.map(jnp.ones_like, weights))  # noqa: E731
     monkeypatch.setattr(learner, "_gradients", up)
     monkeypatch.setattr(localiser, "record_drives", lambda *_: jnp.zeros(2))
     before = dataclasses.replace(learner.init(jax.random.PRNGKey(0)), steps=jnp.int32(1000))
     bias = lambda state: float(state.weights["out"]["bias"][0])  # noqa: E731
-    learn = jax.jit(lambda iteration: learner.learn(before, None, params, jax.random.PRNGKey(1), iteration)[0])
+    learn = jax.jit(lambda iteration: learner.learn(before, None, ROVER, jax.random.PRNGKey(1), iteration)[0])
     moved = [bias(before) - bias(learn(iteration)) for iteration in (0, 5, 10)]
-    np.testing.assert_allclose(moved, config.localiser_rate * np.array([1.0, 0.51, 0.02]), rtol=1e-2)
+    np.testing.assert_allclose(moved, ALONG.localiser_rate * np.array([1.0, 0.51, 0.02]), rtol=1e-2)
+
+
+def test_what_the_map_tells_is_added_to_the_localisers_loss(monkeypatch):
+    learner = localiser.LocaliserLearner(None, ROVER, ALONG)
+    learner.map = "a strip"
+    monkeypatch.setattr(localiser, "estimate", lambda weights, drive, n_metres: (drive, drive, drive))
+    monkeypatch.setattr(localiser, "station_loss", lambda *_: (1.0, {}))
+    monkeypatch.setattr(localiser, "map_loss", lambda *_: (jnp.float32(5.0), {}))
+    total, _ = learner._loss(None, jnp.zeros(3), jnp.zeros(3), [10.0])
+    assert float(total) == pytest.approx(1.0 + 3 * 5.0 / 10.0)
 
 
 def test_a_wrong_map_is_of_a_place_at_least_50_m_away():
@@ -134,11 +146,8 @@ def test_a_wrong_map_is_of_a_place_at_least_50_m_away():
 
 def test_drives_begin_where_there_is_room_for_all_their_way(monkeypatch):
     monkeypatch.setattr(drives, "_starts", lambda env, params, keys, n, room: pytest.fail(f"{room:.0f}"))
-    vehicle = SimpleNamespace(period=0.1, speed_max=2.0)
     with pytest.raises(pytest.fail.Exception) as asked:
-        drives.record_drives(
-            SimpleNamespace(env=None), None, SimpleNamespace(vehicle=vehicle), jax.random.PRNGKey(0), 4, 100
-        )
+        drives.record_drives(SimpleNamespace(env=None), None, ROVER, jax.random.PRNGKey(0), 4, 100)
     assert float(str(asked.value)) > 20.0 + 20.0  # at full speed, and on to the goal's far side
 
 

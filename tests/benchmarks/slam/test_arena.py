@@ -197,6 +197,16 @@ def test_a_drive_rests_first_and_its_imu_then_integrates_to_the_way(motion):
     assert felt == pytest.approx(turn, abs=0.05)
 
 
+@pytest.mark.parametrize(("motion", "place"), [
+    ("trolley", (-1160.189108, -216.157893, -17.717746)), ("walk", (-1160.582133, -217.579758, -17.635487)),
+    ("b2", (-1160.929732, -218.534478, -18.466159)),
+])  # fmt: skip
+def test_nine_seconds_after_its_start_a_drive_is_where_it_was_when_programs_were_scored(motion, place):
+    course = record.Course("one", "smooth", "vlp16", motion, distance=20.0)
+    drive = record.draw_scene(course, np.random.SeedSequence(4)).drive
+    np.testing.assert_allclose(drive.poses(np.array([9.0])).position[0], place, atol=5e-6)
+
+
 def test_wheels_have_one_sign_a_robot_and_the_scale_of_real_corridors():
     station = np.linspace(0.0, 20_000.0, 40_001)
     still = Poses(np.zeros((len(station), 3)), np.tile([0.0, 0.0, 0.0, 1.0], (len(station), 1)))

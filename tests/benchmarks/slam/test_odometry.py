@@ -2,6 +2,7 @@
 
 import dataclasses
 from itertools import islice
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -108,6 +109,15 @@ def test_without_brightness_the_way_is_lost():
 
 def test_doppler_gives_the_way_where_walls_are_smooth():
     assert advance(odometry.by_doppler(), drawn(0.0, doppler=True), 28) < 0.01
+
+
+def test_poses_are_of_the_ends_of_sweeps(monkeypatch):
+    points, rest = np.ones(9, DOPPLER_POINT), (np.array([0.0, 0.0, 9.81]), np.zeros(3))
+    samples = [(1_900_000_000, rest), (2_000_000_000, points), (2_100_000_000, points)]
+    monkeypatch.setattr(odometry, "read_samples", lambda path: iter(samples))
+    times, poses, _ = odometry.run(lambda: lambda seen, attitude, rate: np.array([1.0, 2.0, 3.0]), Path("a.bag"))
+    np.testing.assert_allclose(times, [2.1, 2.2])
+    np.testing.assert_allclose(poses[:, :3, 3], [[1.0, 2.0, 3.0]] * 2)
 
 
 def test_recordings_without_the_channel_are_refused():
