@@ -95,6 +95,8 @@ def score_files(
 
 LEAST_RATE = 1.0  # poses a second; fewer leave out where a program errs
 LEAST_COVERED = 0.9  # share of a recording below which an estimate is none
+REACH_ERROR = 1.0  # m
+_LEAST_AFTER = 1.0  # s after the truth's end that a program may still report
 
 
 def check_rate(estimate: Path, track: Track) -> None:
@@ -139,9 +141,6 @@ def _check_frame(estimate: Path, track: Track) -> None:
         )
 
 
-REACH_ERROR = 1.0  # m
-
-
 def reach_of(travelled: Float[np.ndarray, " n"], along: Float[np.ndarray, " n"]) -> float | None:
     """Returns the distance driven when the error of the station first exceeds 1 m, m; `None` where it never does."""
     beyond = np.flatnonzero(np.abs(along) > REACH_ERROR)
@@ -183,9 +182,6 @@ def _score_path(path: Path, config: ScoreConfig) -> list[Score]:
         score, _ = score_files(estimate, truth, axis=config.axis, alignment=config.alignment)
         scores.append(dataclasses.replace(score, program=program))
     return scores
-
-
-_LEAST_AFTER = 1.0  # s after the truth's end that a program may still report
 
 
 def doubts(config: ScoreConfig, scores: list[Score]) -> list[str]:
