@@ -110,8 +110,17 @@ class AutoReset:
     ) -> tuple[Obs, Obs]:
         """Observations after and before any reset.
 
-        Of those before, only finished environments are cast again.
+        Of those before, only finished environments are cast again. The fused kernels take all scans in one go and skip
+        those that nobody wants.
         """
+        if self.env.skips_unneeded(params):
+            twice = lambda one, other: jnp.concatenate([one, other])  # noqa: E731
+            both_states, both_noises = jax.tree.map(twice, (merged, noise), (stepped, noise))
+            both_params = self._of_batched(params, lambda leaf: twice(leaf, leaf))
+            needed = twice(jnp.ones_like(done), done)
+            observe = jax.vmap(self.env.observe, in_axes=(0, 0, self.params_axes, 0))
+            obs, final = jnp.split(observe(both_states, both_noises, both_params, needed), 2)
+            return obs, jnp.where(done[:, None], final, obs)
         obs = self._vmap(self.env.observe, 2)(merged, noise, params)
 
         def again(pick: Callable[[Any], Any]) -> Obs:

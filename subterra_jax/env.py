@@ -78,8 +78,11 @@ class Env(Protocol):
     def advance(self, state: Any, action: Float[Array, n_action], noise: Any, params: Any) -> Stepped:
         """Take one step but its observation: state, reward, terminated, truncated, info."""
 
-    def observe(self, state: Any, noise: Any, params: Any) -> Float[Array, n_obs]:
-        """Observe a state."""
+    def observe(self, state: Any, noise: Any, params: Any, needed: Any = True) -> Float[Array, n_obs]:
+        """Observe a state; where `needed` is false, the observation may be anything."""
+
+    def skips_unneeded(self, params: Any) -> bool:
+        """Tell whether a batch of observations costs little for those that nobody wants."""
 
     def observation_space(self, params: Any) -> Box:
         """Return the bounds of an observation."""

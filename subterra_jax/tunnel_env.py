@@ -196,14 +196,19 @@ class TunnelEnv:
         reward = sum(verdict.terms.values(), jnp.zeros_like(place.station))
         return vary_like(after), reward, terminated, (steps >= params.horizon) & ~terminated, info
 
-    def observe(self, state: State, noise: Mapping[str, Any], params: EnvParams) -> Float[Array, n_obs]:
+    def observe(
+        self, state: State, noise: Mapping[str, Any], params: EnvParams, needed: Any = True
+    ) -> Float[Array, n_obs]:
         """Observe a state.
+
+        Args:
+            needed: Someone will read the observation; where not, ranges may be anything.
 
         Returns:
             Noisy ranges (m), dead-reckoned distance (m) and heading (rad), then the further entries of `fields`.
         """
         tunnel = params.tunnel.pick(state.tunnel)
-        sensing = self._sensing(state, noise, tunnel, params)
+        sensing = self._sensing(state, noise, tunnel, params, needed)
         entries: dict[str, Array] = {}
         for source in self._observers():
             if isinstance(source, Rule):
@@ -212,6 +217,9 @@ class TunnelEnv:
                 own, of_part = state.parts[source.name], noise.get(source.name, _NOTHING)
                 entries |= source.observe(own, sensing, of_part, params)
         return jnp.concatenate([jnp.atleast_1d(entry) for entry in entries.values()])
+
+    def skips_unneeded(self, params: EnvParams) -> bool:
+        return any(part.skips_unneeded(params) for part in self.parts)
 
     @property
     def action_size(self) -> int:
@@ -308,9 +316,11 @@ class TunnelEnv:
             step = dataclasses.replace(step, after={**step.after, part.name: own})
         return step
 
-    def _sensing(self, state: State, noise: Mapping[str, Any], tunnel: Tunnel, params: EnvParams) -> SensingState:
+    def _sensing(
+        self, state: State, noise: Mapping[str, Any], tunnel: Tunnel, params: EnvParams, needed: Any
+    ) -> SensingState:
         """The moment that sensors show, and the obstacles and faults between them and the walls."""
-        sensing = SensingState(tunnel, state.position, state.heading, state.station, state.parts)
+        sensing = SensingState(tunnel, state.position, state.heading, state.station, state.parts, needed)
         for part in self.parts:
             sensing = part.look_from(state.parts[part.name], sensing, params)
 

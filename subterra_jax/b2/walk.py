@@ -56,6 +56,10 @@ class WalkEnv:
         ends = np.cumsum(list(sizes.values())).tolist()
         return {name: slice(end - size, end) for (name, size), end in zip(sizes.items(), ends, strict=True)}
 
+    def skips_unneeded(self, params: WalkParams) -> bool:
+        """Tell that every observation is made."""
+        return False
+
     def observation_space(self, params: WalkParams) -> Box:
         """Return the bounds of an observation: none."""
         size = self.observation_size(params)
@@ -149,8 +153,10 @@ class WalkEnv:
         }
         return after, sum(terms.values(), jnp.zeros(())), fallen, (expired | outside) & ~fallen, info
 
-    def observe(self, state: WalkState, noise: WalkStepNoise | None, params: WalkParams) -> Float[Array, "n_obs"]:
-        """Return the observation of a state, which holds it already; `noise` changes nothing."""
+    def observe(
+        self, state: WalkState, noise: WalkStepNoise | None, params: WalkParams, needed: Bool[Array, ""] | bool = True
+    ) -> Float[Array, "n_obs"]:
+        """Return the observation of a state, which holds it already; `noise` and `needed` change nothing."""
         own = observation.observe_self(state)
         return jnp.concatenate([own, observation.observe_truth(state, params.track)]) if self.privileged else own
 

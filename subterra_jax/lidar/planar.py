@@ -76,6 +76,11 @@ def scan(
     return jnp.minimum(ranges, params.range_max)
 
 
+def skips_unneeded(params: LidarParams) -> bool:
+    """Tell whether the fused kernels cast a batch of scans; they cost little for scans that nobody wants."""
+    return params.fused and kernels.on_nvidia()
+
+
 def _cast(
     what: tuple[Tunnel, LidarParams],
     position: Float[Array, "2"],

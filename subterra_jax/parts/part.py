@@ -106,6 +106,7 @@ class SensingState:
         heading: Heading, rad.
         station: Station, m.
         parts: States of the parts, by name.
+        needed: Someone will read the observation; where not, ranges may be anything.
         hits: From beam directions `(n_beams, 2)` to distances to obstacles, m; `inf` where there are none.
         corrupt: From true ranges to ranges with dust and lost beams, m.
     """
@@ -115,6 +116,7 @@ class SensingState:
     heading: Float[Array, ""]
     station: Float[Array, ""]
     parts: Mapping[str, Any]
+    needed: Any = True
     hits: Callable[[Array], Any] = lambda directions: np.inf
     corrupt: Callable[[Array], Array] = lambda ranges: ranges
 
@@ -236,6 +238,10 @@ class Part(abc.ABC):
     def boxes(self, own: Any, station: Array, tunnel: Tunnel, params: EnvParams) -> list[Boxes]:
         """Return boxes near a station, for pictures."""
         return []
+
+    def skips_unneeded(self, params: EnvParams) -> bool:
+        """Tell whether a batch of observations costs little for those that nobody wants."""
+        return False
 
     @classmethod
     def random_streams(cls) -> tuple[int, ...]:

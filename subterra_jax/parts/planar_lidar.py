@@ -47,7 +47,9 @@ class PlanarLidar(Part):
 
     def true_ranges(self, own: Any, sensing: SensingState, params: EnvParams) -> Array:
         """Cast the beams against the walls, m."""
-        return lidar.scan(sensing.tunnel, sensing.position, sensing.heading, sensing.station, params.lidar)
+        return lidar.scan(
+            sensing.tunnel, sensing.position, sensing.heading, sensing.station, params.lidar, sensing.needed
+        )
 
     def space(self, params: EnvParams) -> dict[str, Bounds]:
         n_beams, range_max = params.lidar.n_beams, jnp.max(jnp.asarray(params.lidar.range_max))
@@ -55,3 +57,6 @@ class PlanarLidar(Part):
         if params.lidar.intensity:
             entries["intensity"] = (np.zeros(n_beams), np.full(n_beams, MOST))
         return entries
+
+    def skips_unneeded(self, params: EnvParams) -> bool:
+        return lidar.skips_unneeded(params.lidar)

@@ -186,6 +186,10 @@ class SwayingLidar(PlanarLidar):
         origin, turn = lidar_pose(ride, sensing, params.track, self.motion.lidar_place)
         return scan(origin, turn, ride.anchor, sensing, params.track, params.lidar, params.relief)
 
+    def skips_unneeded(self, params: EnvParams) -> bool:
+        """Tell that every scan is cast."""
+        return False
+
 
 @dataclasses.dataclass(frozen=True)
 class SwayingSpatialLidar(SpatialLidar):
