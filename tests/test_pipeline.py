@@ -30,7 +30,7 @@ def scene(tmp_path_factory):
 
 
 def device_scans(plan: st.TunnelPlan, poses: reference.Poses, lining: str) -> np.ndarray:
-    """What the environment observes, without noise, from each pose."""
+    """Observations of the environment, without noise, from each pose."""
     env, params = st.make("Subterra/Traverse-v1", tunnel=plan, lining=lining)
     _, state = env.reset(jax.random.key(0), params)
 

@@ -47,7 +47,7 @@ class Trace:
 
     @property
     def ended(self) -> str:
-        """How it ended, in words."""
+        """Outcome of the episode in words: `success`, `contact`, `no success`, or after how many steps it was cut."""
         ended = "success" if self.success else "contact" if self.contact else "no success"
         return ended if self.over else f"cut after {len(self)} steps"
 

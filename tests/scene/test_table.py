@@ -29,7 +29,7 @@ Write = Callable[[Path, Drive | None], Path]
 
 @dataclass(frozen=True)
 class Row:
-    """What a user has, says, and is answered."""
+    """Row of the table: files of a user, words of the command, and its answer."""
 
     write: Write
     said: str  # part of what is printed

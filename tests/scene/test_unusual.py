@@ -32,7 +32,7 @@ HEADERS = np.array([start for start, _, _ in sweeps(40)])
 
 @dataclass(frozen=True)
 class Sweeps:
-    """How a driver publishes sweeps: name, type and values of the times of sweep `k`, its header, and its points."""
+    """A driver's way to publish sweeps: name, type and values of the times of sweep `k`, its header, and its points."""
 
     name: str = "time"
     kind: str = "f8"

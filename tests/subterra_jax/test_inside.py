@@ -1,4 +1,4 @@
-"""What happens inside an episode: hidden starts, ways back, late readings; the floor of what chance reaches."""
+"""Events inside an episode: hidden starts, ways back, late readings; the floor of what chance reaches."""
 
 import dataclasses
 import math

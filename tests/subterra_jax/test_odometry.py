@@ -106,7 +106,7 @@ clearance, foot_of_each = jax.jit(vehicle.clearance), jax.jit(jax.vmap(foot, (No
 
 
 def touching(tunnel, position, station):
-    """Whether a robot at a place is in contact."""
+    """True where a robot at a place is in contact."""
     clear = clearance(tunnel, jnp.array(position, jnp.float32), jnp.float32(station))
     return bool(vehicle.in_contact(tunnel, clear, jnp.float32(station), VEHICLE))
 

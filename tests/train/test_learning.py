@@ -1,4 +1,4 @@
-"""What training learns, and the finished episodes of a run: their order, their window, the policy that is kept."""
+"""Results of training, and the finished episodes of a run: their order, their window, the policy that is kept."""
 
 import dataclasses
 import json
