@@ -9,6 +9,7 @@ from jaxtyping import Float
 from benchmarks.fidelity.candidate import Bore, Candidate, Track
 from benchmarks.fidelity.derive.curve import Curve, cast_profile, interpolate_rows
 from benchmarks.fidelity.derive.surface import Caster
+from benchmarks.fidelity.meshes import count_edges
 from benchmarks.fidelity.references import Truth
 
 NULL_CORNERS = 72  # of the swept polygon
@@ -105,9 +106,9 @@ def _true_mesh(truth: Truth, *names: str) -> trimesh.Trimesh:
 
 def cap_rims(lining: trimesh.Trimesh) -> trimesh.Trimesh:
     """Closes each rim of an open surface with a fan that is wound like the surface."""
-    key = lining.edges_sorted @ [len(lining.vertices), 1]  # as numbers, edges are sorted ten times as fast
-    _, first, count = np.unique(key, return_index=True, return_counts=True)
-    rim = lining.edges[first[count == 1]]
+    _, count, edge = count_edges(lining)
+    once = np.flatnonzero(count[edge] == 1)
+    rim = lining.edges[once[np.argsort(edge[once])]]
     loops = trimesh.graph.connected_components(rim, min_len=3)
     vertices, faces = [np.asarray(lining.vertices)], [np.asarray(lining.faces)]
     for number, loop in enumerate(loops):
