@@ -28,7 +28,7 @@ AGAIN := out/reproduce
 reproduce: $(STAMP)  ## speed, dirty clouds and cells of the board again, on a CPU in about 25 minutes; says what differs from the records
 	$(BIN)/python -m benchmarks.throughput --n 1 1024 --peers none --poses 200000 --out $(AGAIN)/speed
 	test ! -e $(SHARED)/data/dirty_clouds || $(BIN)/python -m benchmarks.dirty $(SHARED)/data/dirty_clouds --out $(AGAIN)/dirty
-	$(BIN)/python -m benchmarks.board --tasks StopAt --start given --splits test-unseen --agents dead-reckoning fused --out $(AGAIN)/board
+	$(BIN)/python -m benchmarks.board --tasks StopAt --start given --splits test-unseen --agents dead-reckoning fused scan-matching --out $(AGAIN)/board
 	$(BIN)/python -m benchmarks.records compare $(AGAIN)/*/records.json
 
 arena: $(STAMP)    ## eighteen drives for SLAM programs into out/arena, 5 minutes and 3.3 GB; goes on where it stopped

@@ -12,11 +12,13 @@ from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import pytest
 import tyro
 
 from subterra_jax.baselines import registry
+from subterra_jax.host.rover import rover_mjcf
 from tests.test_extend import FILES, forget
 
 ROOT = Path(__file__).parents[1]
@@ -58,6 +60,7 @@ def reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     built.parent.mkdir(parents=True)
     with resources.as_file(resources.files("subterra_jax") / "data" / "subterra-351.npz") as packaged:
         shutil.copy(packaged, built)
+    built.with_name("scene.xml").write_bytes(ElementTree.tostring(rover_mjcf()))
     for name, text in FILES.items():
         (tmp_path / name).write_text(text)
     settings = YAML.search((ROOT / "docs" / "guide" / "train.md").read_text())

@@ -40,8 +40,8 @@ class Command:
     out: Path
     task: str = DEFAULT_TASK  # task id; `FILE.py:ID` for one of your own
     # Tunnel file, or a name: `subterra-351`, `metro`, `control`, or several with commas between, of which each
-    # episode draws one: `open:train:0-15`. Left out it is a few of `open:train`, and for a task that covers a
-    # tunnel the packaged one.
+    # episode draws one: `open:train:0-15`. Left out, a task with a goal has `open:train:0-15`, on a CPU `:0-3`, since
+    # each tunnel takes seconds to make (`st.make` has twelve: each kind equally often), and another the packaged one.
     tunnel: Path | None = None
     lining: str | None = None  # variant of the walls; the tunnel's usual one if left out
     # LiDAR; `planar16` is the task's own
@@ -147,7 +147,7 @@ def _one(arguments: Command, world: World) -> int:
     if arguments.evaluation_episodes:
         session.score(last, arguments.evaluation_episodes)
         clock.lap("evaluate")
-    _report(last, time.perf_counter() - started)
+    _report(last, time.perf_counter() - started, world.covers)
     return 0
 
 
@@ -169,14 +169,15 @@ def _several(arguments: Command, world: World) -> int:
     )
 
 
-def _report(snapshot: Snapshot, seconds: float) -> None:
+def _report(snapshot: Snapshot, seconds: float, covers: bool) -> None:
     coverage, success = snapshot.window.mean("coverage"), snapshot.window.mean("success")
     if coverage is None or success is None:
         print(f"no episode has finished in {seconds:.0f} s of training; more --steps are needed")
         return
+    covered = f"coverage {100.0 * coverage:.2f} %, " if covers else ""
     print(
-        f"last {len(snapshot.window.last)} training episodes: coverage {100.0 * coverage:.2f} %, "
-        f"success {100.0 * success:.0f} %; {snapshot.window.count} episodes in {seconds:.0f} s"
+        f"last {len(snapshot.window.last)} training episodes: {covered}success {100.0 * success:.0f} %; "
+        f"{snapshot.window.count} episodes in {seconds:.0f} s"
     )
 
 

@@ -62,15 +62,16 @@ class RunLog:
 
 
 class Bar:
-    """Progress on stderr: steps, steps/s, coverage, success, time left. A line now and then where it is no terminal.
+    """Progress on stderr: steps, steps/s, success, time left. A line now and then where it is no terminal.
 
     Args:
         steps: Steps to train for.
         done: Steps done before.
+        covers: Show coverage too.
     """
 
-    def __init__(self, steps: int, done: int = 0) -> None:
-        self._console, self._steps = Console(stderr=True), steps
+    def __init__(self, steps: int, done: int = 0, covers: bool = False) -> None:
+        self._console, self._steps, self._covers = Console(stderr=True), steps, covers
         self._progress = Progress(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -89,9 +90,10 @@ class Bar:
 
     def show(self, record: dict[str, Any], of: str = "") -> None:
         """Shows one iteration, of one of several runs where it is named."""
+        coverage = f"coverage {_percent(record['coverage_mean_100'])}  " if self._covers else ""
         text = (
             f"{of + '  ' if of else ''}{record['step']:,} steps  {record['timing']['steps_per_second']:,}/s  "
-            f"coverage {_percent(record['coverage_mean_100'])}  success {_percent(record['success_mean_100'])}"
+            f"{coverage}success {_percent(record['success_mean_100'])}"
         )
         self._progress.update(self._task, completed=record["step"], description=text)
         if self._progress.disable and time.monotonic() - self._told > _PLAIN_EVERY:

@@ -123,7 +123,8 @@ def train_sessions(
     config = sessions[0].learner.config
     for session, snapshot in zip(sessions, snapshots, strict=True):
         session.open(snapshot)
-    bar = Bar(config.steps, max((s.iteration for s in snapshots if s), default=0) * config.steps_per_iteration)
+    done = max((s.iteration for s in snapshots if s), default=0) * config.steps_per_iteration
+    bar = Bar(config.steps, done, sessions[0].world.covers)
     with deferred_interrupt() as interrupt:
 
         def stop() -> bool:
@@ -166,7 +167,7 @@ def run_seeds(out: Path, sessions: list[Session], *, resume: bool, overwrite: bo
         return 0
     found = [session.score(snapshot, episodes) for session, snapshot in zip(sessions, last, strict=True)]
     clock.lap("evaluate")
-    write_summary(out, [session.folder.path for session in sessions], found)
+    write_summary(out, [session.folder.path for session in sessions], found, sessions[0].world.covers)
     return 0
 
 
@@ -209,14 +210,14 @@ def reached(run: Path) -> dict[str, float] | None:
     return None
 
 
-def write_summary(out: Path, runs: list[Path], scores: list[dict[str, Any]]) -> None:
+def write_summary(out: Path, runs: list[Path], scores: list[dict[str, Any]], covers: bool) -> None:
     """Prints a line for each seed and their mean ± standard deviation; writes `seeds.json`."""
     rows: list[dict[str, Any]] = [
         {"run": run.name, "reached": reached(run), "last": read_log(run)[-1], "evaluation": found}
         for run, found in zip(runs, scores, strict=True)
     ]
     summary = _mean_and_spread(rows)
-    Console().print(_table(rows, summary))
+    Console().print(_table(rows, summary) if covers else _success_table(rows))
     with replace_file(out / SEEDS) as fresh:
         content = {"schema": "subterra.seeds/1", "goal": GOAL, "mean_sd": summary, "runs": rows}
         fresh.write_text(json.dumps(content) + "\n")
@@ -236,6 +237,23 @@ def _table(rows: list[dict[str, Any]], summary: dict[str, tuple[float, float]]) 
     spread = [[f"{summary[name][k] / _UNIT[name]:,.1f}" for name in summary] for k in (0, 1)]
     grid.add_row("mean", *spread[0])
     grid.add_row("± sd", *spread[1])
+    return grid
+
+
+def _success_table(rows: list[dict[str, Any]]) -> Table:
+    """Makes the table of a task with a goal, where success says all."""
+    grid = Table(title=f"success, %: of the last {WINDOW} training episodes, and of the evaluation")
+    for heading in ("run", "k steps", "s", "training", "evaluation"):
+        grid.add_column(heading, justify="right", no_wrap=True)
+    for row in rows:
+        last, found = row["last"], 100 * row["evaluation"]["success"]
+        training = "none yet" if last["success_mean_100"] is None else f"{100 * last['success_mean_100']:.0f}"
+        grid.add_row(
+            row["run"], f"{last['step'] / 1e3:,.0f}", f"{last['timing']['seconds']:,.0f}", training, f"{found:.1f}"
+        )
+    scores = np.array([100 * row["evaluation"]["success"] for row in rows])
+    grid.add_section()
+    grid.add_row("mean ± sd", "", "", "", f"{scores.mean():.1f} ± {scores.std(ddof=min(1, len(rows) - 1)):.1f}")
     return grid
 
 

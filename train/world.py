@@ -34,6 +34,11 @@ class World:
     unchanged: Any = None  # its params before `with_reward`; None where nothing was changed
     val: "World | None" = None  # world of the evaluation after training; None is this one
 
+    @property
+    def covers(self) -> bool:
+        """Whether coverage is the task; elsewhere it says nothing."""
+        return hasattr(self.env, "rule") and self.env.rule.goal_kind == "cover"
+
     def scored(self) -> "World":
         """Returns the world of the evaluation after training."""
         return self if self.val is None else self.val

@@ -147,68 +147,78 @@ def _detailed(score: Score) -> str:
     return f"{percent(score.success)} {_interval(score)}, {error}{contact}"
 
 
-# Marker, colour and name of a group; agents without a line in the roster are `other`.
-_LOOKS: dict[Group, tuple[str, str, str]] = {
-    "blind": ("v", "#7a7a7a", "never looks at the walls to localise"),
-    "written": ("o", "#c77700", "written, no map"),
-    "learnt": ("D", "#1b4965", "learnt, no map"),
-    "reward": ("*", "#c1121f", "learnt by reward alone, no map"),
-    "map": ("s", "#1f8a7d", "has the map"),
-    "other": ("P", "#8367c7", "other agents"),
+_OTHERS = "other agents"  # those without a line in the roster
+_LOOKS = {
+    "best written": ("o", "#c77700"),
+    "learnt": ("D", "#1b4965"),
+    "learnt by reward alone": ("*", "#c1121f"),
+    "with map": ("s", "#1f8a7d"),
+    _OTHERS: ("P", "#8367c7"),
 }
-_WORDS = (
-    "Success over the {kinds} with its 95 % interval; small dots: one kind each. Grey: from the floor, the most that"
-    " theory allows without a look at the walls,\nto the ceiling, a filter that has the map and every size. An agent"
-    " below the floor loses way at turns and boxes or trusts a false match; one above the ceiling is so by chance.\n"
-    "{leaks}"
-)
+_WORDS = "Success, %, the mean of {kinds}; bars: 95 % interval; grey: from floor to ceiling\n{leaks}"
+_LANE = 0.24  # height of an agent's line, inches
 
 
 def draw(cells: Cells, split: str = SPLIT) -> Figure:
-    """Draw one panel a task, of the kinds of one split; of all columns where nobody drove in it."""
+    """Draw the best of each group by task, between floor and ceiling, over all columns where nobody drove in a split.
+
+    Agents without a line in the roster all have a line.
+    """
     keys = [key for key in keys_of(cells) if key[0] == split] or keys_of(cells)
-    cells = [cell for cell in cells if summarise(cell, keys) is not None]
-    settings = settings_of(cells)
-    n_columns = min(3, len(settings))
-    shape = (-(-len(settings) // n_columns), n_columns)
-    size = (1.0 + 4.0 * max(2, n_columns), 1.6 + 2.3 * shape[0])
-    figure, grid = plt.subplots(*shape, figsize=size, squeeze=False, layout="constrained", sharex=True)
-    for axes, setting in zip(grid.flat, settings, strict=False):
-        _panel(axes, setting.words, [cell for cell in cells if setting_of(cell) == setting], keys)
-    for axes in list(grid.flat)[len(settings) :]:
-        axes.axis("off")
-    for axes in grid[-1]:
-        axes.set_xlabel("success, %")
-    found = (zip(*axes.get_legend_handles_labels(), strict=True) for axes in grid.flat)
-    handles = {name: handle for pairs in found for handle, name in pairs}
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=6, fontsize=9)
-    leaks = "; ".join(find_leaks(cells)) or "No figure is beyond a bound by four standard errors."
+    blocks = [(setting, _lanes(cells, setting, keys, split)) for setting in settings_of(cells)]
+    blocks = [(setting, lanes) for setting, lanes in blocks if lanes]
+    height = _LANE * sum(len(lanes) + 1.3 for _, lanes in blocks)
+    figure, axes = plt.subplots(figsize=(8.0, 1.5 + height), layout="constrained")
+    first, ticks = 0.0, []
+    for setting, lanes in blocks:
+        _bounds(axes, [cell for cell in cells if setting_of(cell) == setting], keys, first, first + len(lanes))
+        for row, lane in enumerate(lanes):
+            _lane(axes, first + row + 0.5, *lane)
+        ticks.append(first + len(lanes) / 2)
+        first += len(lanes) + 1.3
+    axes.set(xlim=(-2.0, 104.0), ylim=(first - 1.0, -1.2), xlabel="success, %")
+    axes.set_yticks(ticks, [setting.words.replace(", ", "\n") for setting, _ in blocks], fontsize=10, weight="bold")
+    axes.tick_params(axis="y", length=0)
+    axes.spines[["left", "right", "top"]].set_visible(False)
+    named = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
+    figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=6, fontsize=9, frameon=False)
+    leaks = f"Beyond a bound: {'; '.join(found)}" if (found := find_leaks(cells)) else ""
     kinds = f"{len(keys)} kinds of {split}" if keys[0][0] == split else f"{len(keys)} columns"
-    figure.suptitle(_WORDS.format(kinds=kinds, leaks=leaks), fontsize=9)
+    figure.suptitle(_WORDS.format(kinds=kinds, leaks=leaks).strip(), fontsize=9)
     return figure
 
 
-def _panel(axes: Axes, title: str, cells: Cells, keys: list[Key]) -> None:
-    shown = [cell for cell in cells if entry_of(cell["agent"]).group not in ("ceiling", "truth")]
-    for row, cell in enumerate(shown):
-        marker, colour, name = _LOOKS[entry_of(cell["agent"]).group]
-        whole, each = summarise(cell, keys), [summarise(cell, (key,)) for key in keys]
-        assert whole is not None
-        parts = [100.0 * one.success for one in each if one is not None]
-        axes.plot(parts, [row] * len(parts), ".", ms=5, color=colour, alpha=0.35, mew=0)
-        ends = [[100.0 * max(whole.success - whole.low, 0.0)], [100.0 * max(whole.high - whole.success, 0.0)]]
-        axes.errorbar(100.0 * whole.success, row, xerr=ends, fmt=marker, ms=7, lw=1.5, color=colour, mec="white",
-                      mew=0.5, label=name)  # fmt: skip
-    floor = next((one.floor for cell in cells if (one := summarise(cell, keys)) is not None), None) or 0.0
-    top = next((one for cell in cells if cell["agent"] == CEILING and (one := summarise(cell, keys))), None)
-    ceiling = 1.0 if top is None else top.success
-    axes.axvspan(100.0 * floor, 100.0 * ceiling, color="#e9e9e9", zorder=0)
+def _lanes(cells: Cells, setting: Setting, keys: list[Key], split: str) -> list[tuple[str, str, Score]]:
+    """Return a line for each group of a task: heading, best agent and its score."""
+    mine = [cell for cell in cells if setting_of(cell) == setting]
+    scores = {cell["agent"]: score for cell in mine if (score := summarise(cell, keys)) is not None}
+    lanes = []
+    for heading, groups in GROUPS.items():
+        of_group = [agent for agent in scores if entry_of(agent).group in groups]
+        if of_group:
+            best = best_of(cells, setting, groups, split) or max(of_group, key=lambda agent: scores[agent].success)
+            lanes.append((heading, best, scores[best]))
+    return lanes + [(_OTHERS, agent, score) for agent, score in scores.items() if entry_of(agent).group == "other"]
+
+
+def _bounds(axes: Axes, cells: Cells, keys: list[Key], top: float, bottom: float) -> None:
+    """Draw floor and ceiling of a task, and the band between them."""
+    scores = {cell["agent"]: score for cell in cells if (score := summarise(cell, keys)) is not None}
+    floor = next((score.floor for score in scores.values()), None) or 0.0
+    ceiling = scores[CEILING].success if CEILING in scores else 1.0
+    axes.fill_betweenx([top, bottom], 100 * floor, 100 * ceiling, color="#e9e9e9", lw=0.0, zorder=0)
     for place, name in ((floor, "floor"), (ceiling, "ceiling")):
-        axes.axvline(100.0 * place, color="#555555", lw=1.0, ls="--", zorder=1)
-        axes.text(100.0 * place, -0.62, f"{name} {100 * place:.0f}", ha="center", va="bottom", fontsize=7.5)
-    axes.set_title(title, fontsize=11, pad=12)
-    axes.set(xlim=(-3.0, 104.0), ylim=(len(shown) - 0.4, -0.6))
-    axes.set_yticks(range(len(shown)), [cell["agent"] for cell in shown], fontsize=8.5)
-    for label, cell in zip(axes.get_yticklabels(), shown, strict=True):
-        label.set_color(_LOOKS[entry_of(cell["agent"]).group][1])
-    axes.grid(axis="x", alpha=0.3)
+        axes.vlines(100 * place, top, bottom, color="black", lw=2.0, zorder=1)
+        axes.text(100 * place, top - 0.1, f"{name} {percent(place)}", ha="center", va="bottom", fontsize=7.5)
+
+
+def _lane(axes: Axes, row: float, heading: str, agent: str, score: Score) -> None:
+    """Draw an agent with its interval, figure and name, which stand where there is room."""
+    marker, colour = _LOOKS[heading]
+    low, success, high = (100 * value for value in (score.low, score.success, score.high))
+    ends = [[max(success - low, 0.0)], [max(high - success, 0.0)]]
+    axes.errorbar(success, row, xerr=ends, fmt=marker, ms=8, lw=2.0, color=colour, label=heading, zorder=3)
+    place, side = (max(high, success) + 1.6, "left") if success < 60.0 else (min(low, success) - 1.6, "right")
+    behind = {"fc": "white", "alpha": 0.8, "lw": 0.0, "pad": 0.8}
+    axes.text(place, row, f"{percent(score.success)}  {agent}", color=colour, fontsize=8.5, ha=side, va="center",
+              bbox=behind)  # fmt: skip

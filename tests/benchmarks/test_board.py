@@ -98,14 +98,15 @@ def test_tables_and_records_hold_every_agent():
     assert "--texture 0.5" in bright.command
 
 
-def test_the_picture_names_every_agent_between_floor_and_ceiling_and_marks_its_group():
-    names = ("fused", "scan-matching", "locate-map", "locate-transformer")
-    some = [cell(name, 0.5, splits=SPLITS) for name in (*names, "oracle")]
-    figure = tables.draw([*some, cell("ceiling", 0.9, splits=SPLITS)])
-    (axes,) = figure.axes
-    assert axes.patches[0].get_extents().transformed(axes.transData.inverted()).intervalx == pytest.approx([30.0, 90.0])
-    assert [label.get_text() for label in axes.get_yticklabels()] == list(names)
-    assert [text.get_text() for text in axes.texts] == ["floor 30", "ceiling 90"]
+def test_the_picture_names_the_best_of_each_group_and_agents_of_ones_own_between_floor_and_ceiling():
+    success = {"fused": 0.4, "scan-matching": 0.5, "locate-transformer": 0.7, "locate-map": 0.9, "mine.py:Own": 0.1}
+    some = [cell(name, value, splits=SPLITS) for name, value in {**success, "oracle": 1.0, "ceiling": 0.95}.items()]
+    (axes,) = tables.draw(some).axes
+    band = axes.collections[0].get_datalim(axes.transData)
+    assert (band.x0, band.x1) == pytest.approx((30.0, 95.0))
+    texts = [text.get_text() for text in axes.texts]
+    assert texts[:2] == ["floor 30", "ceiling 95"]
+    assert texts[2:] == ["50  scan-matching", "70  locate-transformer", "90  locate-map", "10  mine.py:Own"]
     handles, groups = axes.get_legend_handles_labels()
     assert len(set(groups)) == len({handle[0].get_marker() for handle in handles}) == 4
 

@@ -257,7 +257,7 @@ def test_the_table_of_seeds_has_a_line_each_and_their_mean_and_spread(tmp_path, 
         line = {"episodes": 120, "coverage_mean_100": 0.95, "success_mean_100": 1.0, "step": steps, "timing": timing}
         (run / "log.jsonl").write_text(json.dumps(line) + "\n")
         found.append(run)
-    session.write_summary(tmp_path / "out", found, [{"success": 1.0}, {"success": 0.5}])
+    session.write_summary(tmp_path / "out", found, [{"success": 1.0}, {"success": 0.5}], covers=True)
     told = json.loads((tmp_path / "out" / "seeds.json").read_text())["mean_sd"]
     assert told["steps"] == pytest.approx([2000.0, 1000.0 * np.sqrt(2.0)])
     assert told["seconds_compiled"] == pytest.approx([15.0, 10.0 * np.sqrt(2.0)])
@@ -268,3 +268,6 @@ def test_the_table_of_seeds_has_a_line_each_and_their_mean_and_spread(tmp_path, 
     assert cells["seed-1"] == ["120.0", "3.0", "30.0", "25.0", "95.00", "50.0"]
     assert cells["mean"] == ["120.0", "2.0", "20.0", "15.0"]
     assert [line for line in lines if "± sd" in line]
+    session.write_summary(tmp_path / "out", found, [{"success": 1.0}, {"success": 0.5}], covers=False)
+    assert "75.0 ± 35.4" in (goal := capsys.readouterr().out)
+    assert "overage" not in goal
