@@ -122,7 +122,7 @@ def read_records(path: Path) -> list[Record]:
     try:
         content = json.loads(path.read_text())
         if content["schema"] != SCHEMA:
-            raise BenchmarkError(f"{path}: has the schema {content['schema']!r}, wanted is {SCHEMA!r}")
+            raise BenchmarkError(f"{path}: has the schema {content['schema']!r}, needed is {SCHEMA!r}")
         found = []
         for fields in content["records"]:
             ends = fields.pop("interval")

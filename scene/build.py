@@ -35,7 +35,7 @@ from scene.poses.place import Placed, place_cloud, place_recording
 from scene.progress import Stages
 from scene.reading.formats import describe, detect
 from scene.reading.ringsurvey import read_ring_survey
-from scene.reading.tables import told_columns
+from scene.reading.tables import given_columns
 from scene.writing.folder import Reconstruction, write_folder
 from scene.writing.track import Track, describe_track, lay_track
 from subterra_jax.host.command import parse, run_command
@@ -209,7 +209,7 @@ def _fit_cloud(placed: Placed, config: ReconstructConfig, progress: Stages) -> R
 
 
 def _fit_rings(path: Path, config: ReconstructConfig, progress: Stages) -> Reconstruction:
-    survey = read_ring_survey(path, config.reading.unit, told_columns(path, config.reading.columns))
+    survey = read_ring_survey(path, config.reading.unit, given_columns(path, config.reading.columns))
     if config.extent.reverse:
         survey = survey.reversed()
     print(f"detected: {describe({'kind': 'ring survey', **survey.facts})}", flush=True)
@@ -220,16 +220,16 @@ def _fit_rings(path: Path, config: ReconstructConfig, progress: Stages) -> Recon
 
 def judge(result: Reconstruction, track: Track, config: JudgingConfig) -> Judgement:
     """Judges a bore with its track against all returns, and its sizes against those of tunnels."""
-    odd = doubt_bore(result.bore, result.facts, result.provenance, result.everything is not None)
-    odd += doubt_track(track, result.seen, result.facts.get("pose_doubt"))
-    odd += [] if result.cloud is None else doubt_layers(result.bore, result.cloud)
+    doubts = doubt_bore(result.bore, result.facts, result.provenance, result.everything is not None)
+    doubts += doubt_track(track, result.seen, result.facts.get("pose_doubt"))
+    doubts += [] if result.cloud is None else doubt_layers(result.bore, result.cloud)
     judgement = Judgement(config.tolerance, ())
     if result.everything is not None:
         zone = track_zone(track, result.bore)
         judgement = judge_bore(result.bore, result.everything, config, zone, result.cause, result.removed)
     doubt = result.facts.get("clock_doubt") or result.facts.get("pose_doubt")
     seen = blame_poses(judgement.warnings) if doubt else judgement.warnings
-    found = sorted([*odd, *seen], key=lambda warning: not warning.refuses)
+    found = sorted([*doubts, *seen], key=lambda warning: not warning.refuses)
     return replace(judgement, warnings=tuple(found))
 
 

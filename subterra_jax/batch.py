@@ -82,10 +82,10 @@ class AutoReset:
         stepped, reward, terminated, truncated, info = self._vmap(self.env.advance, 3)(state, action, noise, params)
         # A consumer's sum would draw the whole step into its kernel, which sums with few threads; also below.
         terminated, truncated = jax.lax.optimization_barrier((terminated, truncated))
-        begun = self._vmap(self.env.begin, 1)(self.env.draw_reset(start_key, (n_envs,), params), params)
+        fresh = self._vmap(self.env.begin, 1)(self.env.draw_reset(start_key, (n_envs,), params), params)
         done = terminated | truncated
         merged = jax.tree.map(
-            lambda new, old: jnp.where(done.reshape(-1, *[1] * (old.ndim - 1)), new, old), begun, stepped
+            lambda new, old: jnp.where(done.reshape(-1, *[1] * (old.ndim - 1)), new, old), fresh, stepped
         )
         obs, info["final_observation"] = self._observe(done, merged, stepped, noise, params)
         shown = jax.lax.optimization_barrier((obs, merged, reward, terminated, truncated))

@@ -102,10 +102,10 @@ class Driver:
         device does not tell.
         """
         seed, whole = jax.ShapeDtypeStruct((n,), jnp.uint32), jax.ShapeDtypeStruct((n,), jnp.int32)
-        begun = _begin.lower(self, agent, params, seed, whole, whole)
+        begin = _begin.lower(self, agent, params, seed, whole, whole)
         first = jax.ShapeDtypeStruct((), jnp.int32)
-        gone = _go.lower(self, n_steps, agent, params, first, begun.out_info)
-        found = (program.compile().memory_analysis() for program in (begun, gone))
+        gone = _go.lower(self, n_steps, agent, params, first, begin.out_info)
+        found = (program.compile().memory_analysis() for program in (begin, gone))
         return max(int(one.temp_size_in_bytes + one.output_size_in_bytes) if one else 0 for one in found)
 
     def drive(

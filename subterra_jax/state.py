@@ -33,7 +33,7 @@ def as_array(value: Any, like: Any = None) -> Any:
     """
     wants_whole = like is not None and jnp.issubdtype(like.dtype, jnp.integer)
     if wants_whole and isinstance(value, float) and not value.is_integer():
-        raise ValueError(f"a whole number is wanted, got {value}")
+        raise ValueError(f"a whole number is needed, got {value}")
     if not isinstance(value, _NUMBERS) or jax.dtypes.issubdtype(jnp.result_type(value), jax.dtypes.extended):
         return value
     whole = jnp.issubdtype(jnp.result_type(value), jnp.integer)
@@ -136,7 +136,7 @@ class _ParamsOfParts(_Named):
     faults: _Entry[Any] = _Entry()
     imu: _Entry[Any] = _Entry()
     goal: _Entry[Any] = _Entry()
-    told: _Entry[Any] = _Entry()
+    reported: _Entry[Any] = _Entry()
     goal_coverage: _Entry[Float[Array, ""]] = _Entry()
     track: _Entry[Any] = _Entry()  # the ground of robots by physics: `physics.ground`
     walk: _Entry[Any] = _Entry()  # the walking robot, its gait, and the surface that it sees: `b2.mission`

@@ -345,7 +345,7 @@ def _require_planar(id: str, sensor: Any, sweep: bool, doppler: bool = False) ->
     if not is_planar(sensor):
         raise ValueError(f"{id} has the sensor {SENSORS[0]!r} alone, got {sensor!r}")
     if sweep:
-        raise ValueError(f"{SENSORS[0]!r} measures a scan at one moment: sweep=True needs a LiDAR in three dimensions")
+        raise ValueError(f"{SENSORS[0]!r} measures a scan at one instant: sweep=True needs a LiDAR in three dimensions")
     if doppler:
         raise ValueError(f"{SENSORS[0]!r} has no Doppler channel: doppler=True needs a LiDAR in three dimensions")
 

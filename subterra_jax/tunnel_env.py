@@ -319,7 +319,7 @@ class TunnelEnv:
     def _sensing(
         self, state: State, noise: Mapping[str, Any], tunnel: Tunnel, params: EnvParams, needed: Any
     ) -> SensingState:
-        """The moment that sensors show, and the obstacles and faults between them and the walls."""
+        """The state that sensors show, and the obstacles and faults between them and the walls."""
         sensing = SensingState(tunnel, state.position, state.heading, state.station, state.parts, needed)
         for part in self.parts:
             sensing = part.look_from(state.parts[part.name], sensing, params)

@@ -73,8 +73,8 @@ def test_the_notebook_builds_steps_trains_and_plots(tmp_path):
     NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(tmp_path)}}).execute()
     outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
     assert sum("image/png" in output.get("data", {}) for output in outputs) == 3
-    told = "".join(output.get("text", "") for output in outputs)
-    assert "simulated: 30." in told or "simulated: 29." in told
-    success = float(told.split("success of 100 episodes: ")[1].split("%")[0])
+    outcome = "".join(output.get("text", "") for output in outputs)
+    assert "simulated: 30." in outcome or "simulated: 29." in outcome
+    success = float(outcome.split("success of 100 episodes: ")[1].split("%")[0])
     assert success > 80.0
     assert (tmp_path / "out" / "notebook" / "training" / "checkpoint").is_dir()

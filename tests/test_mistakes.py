@@ -215,10 +215,10 @@ def run(words: list[str], monkeypatch: pytest.MonkeyPatch) -> object:
 def test_a_mistake_is_one_sentence_and_status_2_and_leaves_nothing(words, desk, monkeypatch, capfd):
     before = sorted(desk.rglob("*"))
     assert run(shlex.split(words), monkeypatch) == 2
-    told = capfd.readouterr().err
-    assert told.startswith("error: ")
-    assert told.count("\n") == 1, told
-    assert MISTAKES[words] in told
+    output = capfd.readouterr().err
+    assert output.startswith("error: ")
+    assert output.count("\n") == 1, output
+    assert MISTAKES[words] in output
     assert sorted(desk.rglob("*")) == before
 
 

@@ -63,10 +63,10 @@ def test_the_simulator_is_imported_quickly_and_says_nothing(tmp_path):
     words = (sys.executable, "-X", "importtime", "-W", "error::UserWarning", "-c", line)
     done = subprocess.run(words, check=True, capture_output=True, text=True, cwd=tmp_path)
     assert float(done.stdout) < 2.0  # s of a processor: what else runs here does not count
-    noise = [told for told in done.stderr.splitlines() if not told.startswith("import time:")]
+    noise = [outcome for outcome in done.stderr.splitlines() if not outcome.startswith("import time:")]
     assert noise == []
     # What takes long to import and is needed by some only.
-    loaded = {told.split("|")[-1].strip().split(".")[0] for told in done.stderr.splitlines()}
+    loaded = {outcome.split("|")[-1].strip().split(".")[0] for outcome in done.stderr.splitlines()}
     assert not loaded & {"mujoco", "torch", "matplotlib", "brax", "numba"}
 
 

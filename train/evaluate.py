@@ -97,8 +97,8 @@ def command(arguments: Command) -> None:
     if arguments.json:
         print(json.dumps(found))
     else:
-        told = {name: value for name, value in found.items() if value is not None and name not in world.facts}
-        print_table(f"{world.task}, {world.facts['tunnel']}, {world.facts['lining']}: {Path(source).name}", told)
+        table = {name: value for name, value in found.items() if value is not None and name not in world.facts}
+        print_table(f"{world.task}, {world.facts['tunnel']}, {world.facts['lining']}: {Path(source).name}", table)
 
 
 def main() -> None:

@@ -129,11 +129,11 @@ class RunFolder:
         if not place.exists():
             return
         try:
-            begun = json.loads(place.read_text())
-            kind, config = begun["kind"], begun["config"]
+            saved = json.loads(place.read_text())
+            kind, config = saved["kind"], saved["config"]
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise ConfigError(f"{place}: cannot be read; --overwrite begins anew") from error
-        self._check_same(kind, begun, config)
+        self._check_same(kind, saved, config)
 
     def _check_same(self, kind: str, world: dict[str, Any], settings: dict[str, Any]) -> None:
         """Refuses a run of another network, on something else or with other settings.

@@ -67,10 +67,10 @@ def in_a_row(finished: Finished) -> Ended:
     return Ended(count=so_far[-1], index=index, **rows)
 
 
-Told = tuple[Ended, dict[str, np.ndarray]]
+Fetched = tuple[Ended, dict[str, np.ndarray]]
 
 
-def fetch(given: Report, n: int | None = None) -> list[Told]:
+def fetch(given: Report, n: int | None = None) -> list[Fetched]:
     """Fetches the ended episodes, cut to their count, and the metrics, in one transfer.
 
     Args:
@@ -85,7 +85,7 @@ def fetch(given: Report, n: int | None = None) -> list[Told]:
     if n is None:
         return [(_cut(ended, shape, lambda: given.finished), metrics)]
 
-    def one(k: int) -> Told:
+    def one(k: int) -> Fetched:
         mine, scalars = jax.tree.map(lambda x: x[k], (ended, metrics))
         return _cut(mine, shape[1:], lambda: jax.tree.map(lambda x: x[k], given.finished)), scalars
 

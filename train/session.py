@@ -102,8 +102,8 @@ class Session:
         found = evaluate(self.world.scored(), agent, episodes)
         self.folder.write_json(EVALUATION, {"schema": "subterra.evaluation/1", **self.world.facts, **found})
         kept = "best" if self.learner.config.KEEPS_BEST else "last"
-        told = {name: value for name, value in found.items() if value is not None and value != SHA256}
-        print_table(f"{self.world.task}, seed {self.learner.config.seed}: {kept} policy, no exploration noise", told)
+        table = {name: value for name, value in found.items() if value is not None and value != SHA256}
+        print_table(f"{self.world.task}, seed {self.learner.config.seed}: {kept} policy, no exploration noise", table)
         return found
 
 

@@ -49,8 +49,8 @@ class Lacking(Learnt):
     def _less(self, obs: Observed, params: EnvParams) -> Observed:
         changed: dict[str, Any] = {}
         if self.lacks == "start":
-            told = params.start.station if obs.start is None else obs.start
-            changed = {"start": jnp.asarray(told) + _START_OFF}
+            reported = params.start.station if obs.start is None else obs.start
+            changed = {"start": jnp.asarray(reported) + _START_OFF}
         elif self.lacks == "walls":
             changed = {"ranges": jnp.full_like(obs.ranges, params.lidar.range_max)}
         elif self.lacks == "odometry":

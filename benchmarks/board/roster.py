@@ -48,6 +48,7 @@ ROSTER = (
     Entry("scan-matching", "written", _TUNED),
     Entry("locate-transformer", "learnt", _TRAINED, _STOPS, hidden=False),
     Entry("StopAt-v1", "learnt", f"{_TRAINED}; its speed, steering and stop by reward", _STOPS, hidden=False),
+    Entry("Return-locate", "learnt", f"{_TRAINED}; its speed, steering and stop by reward", ("Return",), hidden=False),
     Entry("locate-obstructed", "learnt", _TRAINED, ("Obstructed",), hidden=False),
     Entry("locate-faulted", "learnt", _TRAINED, ("Faulted",), hidden=False),
     Entry("StopAt-plain", "reward", f"{_TRAINED}; by reward alone", _STOPS, hidden=False),

@@ -1,4 +1,4 @@
-"""Draws the wall of each kind rolled out, as a LiDAR reads its intensities and as a picture shows it.
+"""Draws the wall of each kind unrolled, as a LiDAR reads its intensities and as a picture shows it.
 
 `python -m benchmarks.draw walls --out docs/walls.png`
 """
@@ -58,7 +58,7 @@ def run(config: WallsConfig) -> None:
 
 
 def read(tunnel: st.TunnelPlan, texture: float) -> np.ndarray:
-    """Returns the wall rolled out, `(around, along)`: logarithms beside the mean of each angle, NaN where unseen."""
+    """Returns the wall unrolled, `(around, along)`: logarithms beside the mean of each angle, NaN where unseen."""
     env, params = st.make("Subterra/TraverseShort-v1", tunnel=tunnel, sensor="vlp16", intensity=True, texture=texture)
     places = np.arange(_BEGIN - 3.0, _END + 3.0, _STEP)
     seen = look_along(env, params, jnp.asarray(places[:, None], jnp.float32), 0)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from brax.envs.base import State, Wrapper
 from brax.training.agents.ppo import train as ppo
-from watch import Act, Watch, features
+from watch import Act, Watch, eased, features
 
 from subterra_jax.adapters.brax import RescaleAction, SubterraBraxEnv, jax_for_brax, wrap
 
@@ -16,7 +16,7 @@ class _Enough(Exception):
 
 
 class Look(Wrapper):
-    """Shows features in place of observations."""
+    """Shows features in place of observations, and eases actions."""
 
     def __init__(self, env: Any, look: Any) -> None:
         super().__init__(env)
@@ -34,7 +34,7 @@ class Look(Wrapper):
 
     def step(self, state: State, action: jax.Array) -> State:
         """Drives one control period."""
-        state = self.env.step(state, action)
+        state = self.env.step(state, eased(action))
         return state.replace(obs=self.look(state.obs))
 
 
@@ -50,7 +50,7 @@ def train(watch: Watch, steps: int, seed: int) -> None:
 
             def act(weights: Any, obs: jax.Array) -> jax.Array:
                 action, _ = make_policy(weights, deterministic=True)(see(obs), jax.random.key(0))
-                return low + 0.5 * (jnp.clip(action, -1.0, 1.0) + 1.0) * (high - low)
+                return low + 0.5 * (eased(jnp.clip(action, -1.0, 1.0)) + 1.0) * (high - low)
 
         if now and watch(now, Act(act, weights)):
             raise _Enough

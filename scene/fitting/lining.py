@@ -288,9 +288,9 @@ def add_standard_lining(
 
 
 def _add_universal_lining(
-    bore: Bore, config: LiningConfig, flat_floor: bool, told: Float[np.ndarray, " j"]
+    bore: Bore, config: LiningConfig, flat_floor: bool, given: Float[np.ndarray, " j"]
 ) -> tuple[Bore, dict[str, str]]:
-    joints = told if len(told) else np.arange(config.ring_width / 2, bore.length, config.ring_width)
+    joints = given if len(given) else np.arange(config.ring_width / 2, bore.length, config.ring_width)
     offset = config.pocket_offset / float(bore.radius.mean())
     station, angle = place_pockets(joints, config.seed, offset)
     keep = _is_even(bore, station) & (np.sin(angle) > -np.sin(config.filled_angle))
@@ -302,7 +302,7 @@ def _add_universal_lining(
     joints = joints[_is_even(bore, joints)]
     bore = replace(bore, pocket=pockets, ring_joint=joints if surveyed else bore.ring_joint)
     return bore if surveyed else replace(bore, ring_station=joints), {
-        "rings": f"{MEASURED}, those between by their numbers" if len(told) else MEASURED if surveyed else STANDARD,
+        "rings": f"{MEASURED}, those between by their numbers" if len(given) else MEASURED if surveyed else STANDARD,
         "pockets": f"{STANDARD}, turns drawn with seed {config.seed}",
         "nails": "none: ring joints by standard have dowels",
     }

@@ -1,4 +1,4 @@
-"""Bolt pockets and ring joints, found on the wall rolled out flat.
+"""Bolt pockets and ring joints, found on the wall unrolled.
 
 A pocket is a hole in the returns that lie on the wall, with returns behind it. Seen along the tunnel its back is mostly
 hidden by its own edge, so that one pocket says little about its depth or size. But the pockets of a lining come from

@@ -55,9 +55,9 @@ def fit_rings(survey: RingSurvey) -> RingFit:
     if (rms > _LARGEST_RESIDUAL).any():
         worst = int(np.argmax(rms))
         raise _refuse(survey, f"ring {survey.names[worst]} is no circle (rms {rms[worst]:.2f} m)")
-    odd = (radius < _RADII[0]) | (radius > _RADII[1])
-    if odd.any():
-        worst = int(np.argmax(odd))
+    wrong = (radius < _RADII[0]) | (radius > _RADII[1])
+    if wrong.any():
+        worst = int(np.argmax(wrong))
         why = f"ring {survey.names[worst]} has a radius of {radius[worst]:.4g} m; is the unit right?"
         raise _refuse(survey, why)
     _require_no_gap(survey, centre)

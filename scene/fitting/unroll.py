@@ -1,4 +1,4 @@
-"""The wall rolled out flat: a grid over station and angle, and what no scanner saw of it."""
+"""The wall unrolled: a grid over station and angle, and what no scanner saw of it."""
 
 from dataclasses import dataclass
 

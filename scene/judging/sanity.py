@@ -116,10 +116,10 @@ def doubt_bore(bore: Bore, facts: dict[str, Any], provenance: dict[str, str], su
 def _doubt_size(bore: Bore, unit: str) -> list[Warned]:
     width, height = float(np.median(bore.width)), float(np.median(bore.height))
     size = f"the bore would be {width:.3g} m wide and {height:.3g} m high"
-    told = "by flag" in unit
+    by_flag = "by flag" in unit
     if not all(_SIZES[0] <= value <= _SIZES[1] for value in (width, height)):
         return [Warned(Code.SIZE, f"{size}, and no tunnel is; {_propose_unit(width, height, unit)}", refuses=True)]
-    if height > _HIGH and not told:
+    if height > _HIGH and not by_flag:
         return [Warned(Code.SIZE, f"{size}: a cavern, or is the unit another? {_propose_unit(width, height, unit)}")]
     return []
 
@@ -317,10 +317,10 @@ def doubt_track(track: Track, seen: SeenTrack, pose_doubt: str | None = None) ->
     count, measured = len(track.measured), int(track.measured.sum())
     if not count or measured >= _FEW * count:
         return []
-    told = "none of them was seen" if not measured else f"only {measured} of them were seen"
+    observed = "none of them was seen" if not measured else f"only {measured} of them were seen"
     return [Warned(
         Code.SLEEPERS,
-        f"{count} sleepers lie where a spacing of {_spacing(track):.2f} m asks for them, and {told}: the returns "
+        f"{count} sleepers lie where a spacing of {_spacing(track):.2f} m asks for them, and {observed}: the returns "
         "between the rails are too few, or lie too even, to tell them; --track none leaves the track out",
     )]  # fmt: skip
 

@@ -86,9 +86,9 @@ def read_inertial(recording: Recording, topic: str) -> Inertial | None:
     free = float(np.linalg.norm(rows[:, 4:].mean(axis=0))) <= 0.5 * size and size < _FREE
     for (low, high), unit in (((0.0, _FREE), 0.0),) if free else ((_IN_G, GRAVITY), (_IN_SI, 1.0)):
         if low <= size < high:
-            odd = ["rates in deg/s"] * (degrees != 1.0) + ["force without gravity, which is left out"] * free
-            if odd:
-                recording.facts["imu_units"] = f"{topic}: {', '.join(odd)}"
+            notes = ["rates in deg/s"] * (degrees != 1.0) + ["force without gravity, which is left out"] * free
+            if notes:
+                recording.facts["imu_units"] = f"{topic}: {', '.join(notes)}"
                 print(f"IMU {recording.facts['imu_units']}", flush=True)
             return Inertial(rows[:, 0], rows[:, 1:4] * degrees, rows[:, 4:] * unit, topic)
     raise RecordingError(f"{recording.path}: {topic} has a median force of {size:.3g}, which is neither g nor m/s²")

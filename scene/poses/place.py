@@ -246,16 +246,16 @@ def _check_given(recording: Recording, given: Trajectory, reading: ReadingConfig
 
     What blurs the walls for another reason is looked for with the clock set right.
     """
-    told, auto = reading.quaternion or given.order, reading.clock == "auto"
-    poses = reorder(given) if told == "wxyz" else given
+    stated, auto = reading.quaternion or given.order, reading.clock == "auto"
+    poses = reorder(given) if stated == "wxyz" else given
     clock, timed = settle(recording, poses, auto)
-    check = check_poses(recording, timed, told is None)
+    check = check_poses(recording, timed, stated is None)
     if check is not None and check.blurred and not check.wxyz and clock.offset is None and clock.words:
         raise RecordingError(
             f"{recording.path}: {clock.words}; its poses blur walls of {1e3 * check.expected:.0f} mm to "
             f"{1e3 * check.thickness:.0f} mm"
         )
-    order = "xyzw (by default)" if told is None else f"{told} (by {'flag' if reading.quaternion else 'header'})"
+    order = "xyzw (by default)" if stated is None else f"{stated} (by {'flag' if reading.quaternion else 'header'})"
     if check is not None and check.wxyz:
         poses, order = reorder(given), "wxyz (detected: as xyzw they blur the walls)"
         print(f"quaternions of {given.source}: {order}", flush=True)

@@ -11,7 +11,7 @@ from scene.errors import RecordingError
 from scene.progress import Stage
 from scene.reading.formats import Format, ReadingConfig, detect
 from scene.reading.source import CloudSource, Frame, choose_frame, needs_local_points, refuse_damage
-from scene.reading.tables import told_columns
+from scene.reading.tables import given_columns
 
 _COARSE, _HOPELESS = 0.02, 0.25  # m: coordinates rounded so far are reported, and refused
 _REPEATED = 10  # points for each value of a coordinate: on a grid they repeat
@@ -123,4 +123,4 @@ def _open_cloud(path: Path, row: Format, config: ReadingConfig) -> CloudSource:
         raise RecordingError(f"{path}: --columns goes with a table, but this is {row.label}")
     if config.keep_noise and row.name == "las":
         return row.open(path, True)
-    return row.open(path) if config.columns is None else row.open(path, told_columns(path, config.columns))
+    return row.open(path) if config.columns is None else row.open(path, given_columns(path, config.columns))

@@ -112,8 +112,8 @@ def is_ring_survey(path: Path) -> bool:
         return False
 
 
-def read_ring_survey(path: Path, unit: str | None = None, told: dict[str, str] | None = None) -> RingSurvey:
-    """Reads a ring survey, CSV or XLSX; `unit`, a key of `UNITS`, and the columns `told` override the header.
+def read_ring_survey(path: Path, unit: str | None = None, given: dict[str, str] | None = None) -> RingSurvey:
+    """Reads a ring survey, CSV or XLSX; `unit`, a key of `UNITS`, and the columns `given` override the header.
 
     In the layout with `POINT` this must be text, since `0.10` is not `0.1`. Raises `RecordingError`, which names the
     file and the line, or the sheet and row.
@@ -125,7 +125,7 @@ def read_ring_survey(path: Path, unit: str | None = None, told: dict[str, str] |
     with refuse_damage(path, "a readable survey", RecordingError), open_sheets(path) as tables:
         for sheet in tables:
             headers.append(",".join(sheet.header))
-            if columns is None and (columns := _find_ring_columns(sheet.header, told)) is not None:
+            if columns is None and (columns := _find_ring_columns(sheet.header, given)) is not None:
                 _read_rings(path, sheet, columns, rings)
     if columns is None:
         raise RecordingError(f"{path}: columns are {' | '.join(headers)[:_SHOWN]!r}; {NEEDED} are needed")
@@ -143,19 +143,19 @@ _POINT = ("point", "point no", "point number", "punkt", "punktnr", "punkt nr", "
 _OFFSET = ("offset", "target offset", "prism offset")
 
 
-def _find_ring_columns(header: tuple[str, ...], told: dict[str, str] | None = None) -> _RingColumns | None:
+def _find_ring_columns(header: tuple[str, ...], given: dict[str, str] | None = None) -> _RingColumns | None:
     names = [plain_name(name)[0] for name in header]
-    columns = find_xyz(header, told)
-    if columns is None or (not told and ("chainage" in names or not is_map_name(header[columns[0][0]]))):
+    columns = find_xyz(header, given)
+    if columns is None or (not given and ("chainage" in names or not is_map_name(header[columns[0][0]]))):
         return None
 
     def at(key: str, options: tuple[str, ...]) -> int | None:
-        if told and key in told:
-            return find_column(header, told[key])
+        if given and key in given:
+            return find_column(header, given[key])
         return next((names.index(name) for name in options if name in names), None)
 
     ring, point = at("ring", _RING), at("point", _POINT)
-    if point is None or (ring is None and not told and names[columns[0][0]] != "easting"):
+    if point is None or (ring is None and not given and names[columns[0][0]] != "easting"):
         return None  # a cloud with numbers of points
     return _RingColumns(*columns, point, ring, at("offset", _OFFSET))
 

@@ -52,7 +52,7 @@ def is_map_name(name: str) -> bool:
 COLUMN_KEYS = ("x", "y", "z", "ring", "point", "offset")
 
 
-def told_columns(path: Path, text: str | None) -> dict[str, str] | None:
+def given_columns(path: Path, text: str | None) -> dict[str, str] | None:
     """Return the columns of a file that a user names, `x=Rechtswert,y=Hochwert,z=Hoehe`, by what they hold.
 
     Keys are those of `COLUMN_KEYS`; a column is its name in the header, or its number from 1. `None` where none is
@@ -66,27 +66,27 @@ def told_columns(path: Path, text: str | None) -> dict[str, str] | None:
     return columns or None
 
 
-def find_column(names: Sequence[str], told: str) -> int | None:
+def find_column(names: Sequence[str], given: str) -> int | None:
     """Return the index of a column that a user names by its header or its number from 1; `None` without one."""
-    needed = plain_name(told)[0]
+    needed = plain_name(given)[0]
     for index, name in enumerate(names):
-        if name.strip() == told or plain_name(name)[0] == needed:
+        if name.strip() == given or plain_name(name)[0] == needed:
             return index
-    return int(told) - 1 if told.isdigit() and 0 < int(told) <= len(names) else None
+    return int(given) - 1 if given.isdigit() and 0 < int(given) <= len(names) else None
 
 
-def find_xyz(names: Sequence[str], told: dict[str, str] | None = None) -> tuple[list[int], str | None] | None:
+def find_xyz(names: Sequence[str], given: dict[str, str] | None = None) -> tuple[list[int], str | None] | None:
     """Finds the columns of x, y and z, and their declared unit; `None` where one is missing.
 
-    `told` names columns as `told_columns` returns them. Raises `ValueError` where the three declare different units.
+    `given` names columns as `given_columns` returns them. Raises `ValueError` where the three declare different units.
     """
     known = [plain_name(name) for name in names]
     bare = [name for name, _ in known]
     at = []
     for key, options in zip("xyz", _XYZ_NAMES, strict=True):
         index = next((bare.index(name) for name in options if name in bare), None)
-        if told and key in told:
-            index = find_column(names, told[key])
+        if given and key in given:
+            index = find_column(names, given[key])
         if index is None:
             return None
         at.append(index)
@@ -102,10 +102,10 @@ _DECIMALS = re.compile(r"\s*(?:-?\d+,\d+\s+)+-?\d+(?:,\d+)?\s*")  # numbers apar
 _DELIMITERS = ((";", "semicolon"), ("\t", "tab"), (",", "comma"))
 
 
-def open_table(path: Path, told: dict[str, str] | None = None) -> CloudSource:
+def open_table(path: Path, given: dict[str, str] | None = None) -> CloudSource:
     """Opens a text table: columns that the user named, by the names of its header, or the first three.
 
-    `told` is what `told_columns` returns. Raises `ValueError` where it is no text, or no line near its start holds
+    `given` is what `given_columns` returns. Raises `ValueError` where it is no text, or no line near its start holds
     three numbers.
     """
     with path.open("rb") as file:
@@ -116,7 +116,7 @@ def open_table(path: Path, told: dict[str, str] | None = None) -> CloudSource:
     lines = head.decode("utf-8-sig", "replace").splitlines()
     delimiter, name = _find_delimiter(lines)
     comma = delimiter != "," and any("," in line for line in lines) and not any("." in line for line in lines[1:])
-    skip, columns, unit = _find_columns(lines, delimiter, comma, told)
+    skip, columns, unit = _find_columns(lines, delimiter, comma, given)
     start = sum(len(line) for line in head.splitlines(keepends=True)[:skip])
     start = start or len(head) - len(head.removeprefix(b"\xef\xbb\xbf"))
     text = Lines(path, tuple(columns), delimiter, start, skip + 1, None, comma, path.suffix.lower() == ".pts")
@@ -134,21 +134,21 @@ def _find_delimiter(lines: list[str]) -> tuple[str | None, str]:
 
 
 def _find_columns(
-    lines: list[str], delimiter: str | None, comma: bool, told: dict[str, str] | None
+    lines: list[str], delimiter: str | None, comma: bool, given: dict[str, str] | None
 ) -> tuple[int, list[int], str | None]:
     """Number of lines before the numbers, columns of x, y and z, and the unit that a header declares."""
     columns, unit = None, None
-    if told and all(told.get(key, "").isdigit() for key in "xyz"):
-        columns = [int(told[key]) - 1 for key in "xyz"]
+    if given and all(given.get(key, "").isdigit() for key in "xyz"):
+        columns = [int(given[key]) - 1 for key in "xyz"]
     for index, line in enumerate(lines):
         words = [word.strip() for word in line.split(delimiter)]
-        if told and columns is None and _numeric(words[:3], comma):
-            raise ValueError(f"no line of names before line {index + 1} holds the columns {', '.join(told.values())}")
+        if given and columns is None and _numeric(words[:3], comma):
+            raise ValueError(f"no line of names before line {index + 1} holds the columns {', '.join(given.values())}")
         if _numeric(words[:3], comma) or (columns and _numeric([words[i] for i in columns if i < len(words)], comma)):
             return index, columns or [0, 1, 2], unit
-        if not told and {"lat", "latitude", "lon", "longitude"} & {plain_name(word)[0] for word in words}:
+        if not given and {"lat", "latitude", "lon", "longitude"} & {plain_name(word)[0] for word in words}:
             raise ValueError("its columns are in degrees; project them to metres")
-        named = find_xyz(words, told) if len(words) >= 3 else None
+        named = find_xyz(words, given) if len(words) >= 3 else None
         if named is not None:
             columns, unit = named
         elif index and not line.startswith(("#", "/")) and line.strip() and columns:

@@ -222,10 +222,10 @@ class Spans:
         self.rows.append((raw.stamp, raw.received, low, high))
         self.points += len(raw.points)
 
-    def decide(self, told: TimeConfig, why: str = "by flag") -> Convention:
+    def decide(self, given: TimeConfig, why: str = "by flag") -> Convention:
         """Return what the times mean; raises `ValueError` where they fit nothing, or two readings alike.
 
-        `why` says where `told` is from.
+        `why` says where `given` is from.
         """
         table = np.array(self.rows).reshape(-1, 4)
         by_receipt = _headers_repeat(table)
@@ -233,7 +233,7 @@ class Spans:
         note = "; headers repeat, so the time of recording stands for them" if by_receipt else ""
         rows = np.array(self.timed, np.intp)
         rows = rows[np.isfinite(table[rows, 2])]
-        if not len(rows) or told.time_unit == "none":
+        if not len(rows) or given.time_unit == "none":
             return Convention("static", STATIC + note, by_receipt=by_receipt)
         stamp, low, high = stamp[rows], table[rows, 2], table[rows, 3]
         spans = high - low
@@ -243,8 +243,8 @@ class Spans:
             return Convention("static", f"`{self.name}` is {which}: every sweep is taken as static{note}",
                               by_receipt=by_receipt)  # fmt: skip
         decide = self._decide_absolute if _is_absolute(stamp, low, span) else self._decide_relative
-        found = decide(stamp, low, high, told)
-        by = f" ({why})" if told.time_unit or told.time_stamp else ""
+        found = decide(stamp, low, high, given)
+        by = f" ({why})" if given.time_unit or given.time_stamp else ""
         length = max(float(np.quantile(spans, _LONG)) * found.scale, 1e-9)
         reach = max(length, float(np.fmin(_usual_step(stamp), _LONGEST_SWEEP)))
         step = _usual_step(stamp)
@@ -252,31 +252,31 @@ class Spans:
         words = found.words + by + joined + note
         return replace(found, words=words, by_receipt=by_receipt, length=length, reach=reach, step=step)
 
-    def _decide_relative(self, stamp: np.ndarray, low: np.ndarray, high: np.ndarray, told: TimeConfig) -> Convention:
+    def _decide_relative(self, stamp: np.ndarray, low: np.ndarray, high: np.ndarray, given: TimeConfig) -> Convention:
         span, period = float(np.median(high - low)), _usual_step(stamp)
-        unit = told.time_unit or self.unit
+        unit = given.time_unit or self.unit
         unit = unit or self._unit_of_span(span, float(np.median(np.maximum(high, -low))), period)
         scale = _UNITS[unit]
-        side, guessed = "after the stamp (its start)", self.unit is None and told.time_stamp is None
+        side, guessed = "after the stamp (its start)", self.unit is None and given.time_stamp is None
         if float(np.median(-low)) > float(np.median(high)):
             side, guessed = "before the stamp (its end)", False
-        if told.time_stamp is not None:
-            side = f"from its start; the stamp is its {told.time_stamp}"
+        if given.time_stamp is not None:
+            side = f"from its start; the stamp is its {given.time_stamp}"
         evidence = f"; sweeps of {span * scale:.3g} s" + (f", {period:.3g} s apart" if np.isfinite(period) else "")
         words = f"`{self.name}`, {_shown(unit)} {side}{evidence}"
-        return Convention("after", words, scale, reference=told.time_stamp, guessed=guessed)
+        return Convention("after", words, scale, reference=given.time_stamp, guessed=guessed)
 
-    def _decide_absolute(self, stamp: np.ndarray, low: np.ndarray, high: np.ndarray, told: TimeConfig) -> Convention:
-        unit = told.time_unit or self.unit or self._unit_of_growth(stamp, low)
+    def _decide_absolute(self, stamp: np.ndarray, low: np.ndarray, high: np.ndarray, given: TimeConfig) -> Convention:
+        unit = given.time_unit or self.unit or self._unit_of_growth(stamp, low)
         scale = _UNITS[unit]
         ahead = stamp - low * scale
         offset = float(np.median(ahead))
         length = f"sweeps of {np.median(high - low) * scale:.3g} s"
-        if abs(offset) < _SAME_CLOCK and np.median(low) * scale > _FIRST_EPOCH and told.time_stamp is None:
+        if abs(offset) < _SAME_CLOCK and np.median(low) * scale > _FIRST_EPOCH and given.time_stamp is None:
             words = f"`{self.name}`, absolute, {_shown(unit)}; {length}, {offset:+.3g} s from the headers"
             return Convention("same clock", words, scale)
         offsets = _steady_offsets(ahead, _COUNTER * scale if self.counts else 0.0)
-        reference = told.time_stamp or "start"
+        reference = given.time_stamp or "start"
         rule = "each header tells when its sweep began"
         if offsets:
             rule = f"{offsets[0]:.9g} s behind the headers"
@@ -287,7 +287,7 @@ class Spans:
         )
         late = float(np.quantile(high - low, _LONG)) * scale if reference == "end" else 0.0
         return Convention(
-            "other clock", words, scale, reference=reference, guessed=told.time_stamp is None,
+            "other clock", words, scale, reference=reference, guessed=given.time_stamp is None,
             offsets=tuple(one - late for one in offsets),
         )  # fmt: skip
 

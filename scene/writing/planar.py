@@ -23,13 +23,13 @@ _SEEN = ("0", "1")  # groups of geoms that a camera sees
 class Variant:
     """One lining of the tunnel file."""
 
-    bore: Bore  # With the recesses that its wall is rolled out with
+    bore: Bore  # With the recesses that its wall is unrolled with
     recesses: bool  # True where they are cut
     scene: Path  # MJCF file that draws it
 
 
 def seams(variants: dict[str, Variant]) -> dict[str, float]:
-    """Return the angle at which the wall of each variant is cut open to be rolled out flat, rad, by field."""
+    """Return the angle at which the wall of each variant is cut open to be unrolled, rad, by field."""
     return {f"shell_seam_{name}": float(unroll_section(each.bore).angle[0]) for name, each in variants.items()}
 
 

@@ -1,4 +1,4 @@
-"""A bore's wall rolled out flat: its sections, seam and recesses for `subterra_jax.host.unrolled`."""
+"""A bore's wall unrolled: its sections, seam and recesses for `subterra_jax.host.unrolled`."""
 
 import numpy as np
 from jaxtyping import Float, Int

@@ -85,8 +85,8 @@ class SubterraGymnax:
         params = params or self.default_params
         step_key, reset_key = jax.random.split(key)
         own, after, reward, terminated, truncated, info = self.env.step(step_key, state, action, params)
-        begun, done = self.env.reset(reset_key, params), terminated | truncated
-        obs, state = jax.tree.map(lambda new, old: jnp.where(done, new, old), begun, (own, after))
+        fresh, done = self.env.reset(reset_key, params), terminated | truncated
+        obs, state = jax.tree.map(lambda new, old: jnp.where(done, new, old), fresh, (own, after))
         return obs, state, reward, terminated, truncated, {**info, "final_observation": own, "done": done}
 
 

@@ -138,13 +138,13 @@ class SubterraVectorEnv(Door, VectorEnv[Observation, np.ndarray, np.ndarray]):
         Returns:
             Observations to act on next, rewards (float64), terminated, truncated and info, all of `(num_envs, ...)`.
         """
-        begun = self._pending
+        pending = self._pending
         obs, reward, terminated, truncated, step = self.advance(actions)
         done = terminated | truncated
         if self.autoreset_mode == AutoresetMode.SAME_STEP:
             info = {**mask_info(step.info, ~done), **final_info(step, done, self.task.fields)}
         else:
-            info = mask_info(step.info, ~begun)
+            info = mask_info(step.info, ~pending)
         return obs, reward.astype(np.float64), terminated, truncated, info
 
     def advance(self, actions: np.ndarray) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, Report]:
@@ -153,9 +153,9 @@ class SubterraVectorEnv(Door, VectorEnv[Observation, np.ndarray, np.ndarray]):
         The report's observation is from before any reset; that of an environment that is reset instead of stepping
         means nothing.
         """
-        begun, mode = self._pending, self.autoreset_mode
-        if mode == AutoresetMode.DISABLED and begun.any():
-            raise error.ResetNeeded(f"environments {np.flatnonzero(begun).tolist()} have finished: reset them first")
+        pending, mode = self._pending, self.autoreset_mode
+        if mode == AutoresetMode.DISABLED and pending.any():
+            raise error.ResetNeeded(f"environments {np.flatnonzero(pending).tolist()} have finished: reset them first")
         action, env, params = np.asarray(actions), self.task_env, self.task_params
         if action.shape != self.action_space.shape:
             raise ValueError(f"actions must have shape {self.action_space.shape}, got {action.shape}")
@@ -163,11 +163,11 @@ class SubterraVectorEnv(Door, VectorEnv[Observation, np.ndarray, np.ndarray]):
             raise error.ResetNeeded("reset() must come before step()")
         rows, words = _step(env, before, action.astype(np.float32), params)
         step: Report = self.task.read(np.asarray(words))
-        reward = np.where(begun, np.float32(0.0), step.reward)
-        terminated, truncated = step.terminated & ~begun, step.truncated & ~begun
+        reward = np.where(pending, np.float32(0.0), step.reward)
+        terminated, truncated = step.terminated & ~pending, step.truncated & ~pending
         done = terminated | truncated
-        if mode == AutoresetMode.NEXT_STEP and begun.any():
-            rows = _reset(env, begun, before.stream, rows, params)
+        if mode == AutoresetMode.NEXT_STEP and pending.any():
+            rows = _reset(env, pending, before.stream, rows, params)
         elif mode == AutoresetMode.SAME_STEP and done.any():
             rows = _reset(env, done, rows.stream, rows, params)
         if mode != AutoresetMode.SAME_STEP:

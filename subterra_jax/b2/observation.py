@@ -13,7 +13,7 @@ from subterra_jax.physics.rotations import inverse, rotate
 
 _FOLLOW = 0.35  # share of a new reading in the smoothed speed
 _FIELDS = {
-    "rates": 3, "gravity": 3, "velocity": 2, "asked": 3, "told": 3, "trim": 3, "clock": 3, "angles": 12,
+    "rates": 3, "gravity": 3, "velocity": 2, "asked": 3, "commanded": 3, "trim": 3, "clock": 3, "angles": 12,
     "speeds": 12, "action": 12,
 }  # fmt: skip
 _PRIVILEGED = {"true_velocity": 3, "fall_speed": 1, "place": 4, "friction": 1, "mass": 1, "phase_of_track": 2}

@@ -94,7 +94,7 @@ class Walk:
     success: Bool[Array, "*n"]  # the robot has arrived
     contact: Bool[Array, "*n"]  # the robot touched a wall
     fall: Bool[Array, "*n"]  # the robot fell
-    begun: Float[Array, "*n"]  # station of its start, m
+    start: Float[Array, "*n"]  # station of its start, m
 
 
 @struct.dataclass
@@ -102,7 +102,7 @@ class Row:
     """One step of a robot on its way; NaN once it is over."""
 
     lateral: Float[Array, "*n"]  # lateral offset, m
-    command: Float[Array, "*n 2"]  # speed (m/s) and yaw rate (rad/s) that it was told
+    command: Float[Array, "*n 2"]  # speed (m/s) and yaw rate (rad/s) as commanded
     motion: Float[Array, "*n 2"]  # those that it had
     lean: Float[Array, "*n 2"]  # pitch and roll against the track, rad; 0 on the plan
     sway: Float[Array, "*n n_beams"]  # its ranges less those of a level LiDAR without noise, m
@@ -137,8 +137,8 @@ def walk_robots(
 
 
 def _walk(now: Episode) -> Walk:
-    success, contact, fall, begun = now.tally
-    return jax.device_get(Walk(now.state, now.over, success, contact, fall, begun))
+    success, contact, fall, start = now.tally
+    return jax.device_get(Walk(now.state, now.over, success, contact, fall, start))
 
 
 def _start(state: State, params: EnvParams) -> tuple[Array, Array, Array, Array]:
@@ -178,16 +178,16 @@ class _Keep:
 def figures(now: Walk, rows: Row, params: EnvParams) -> dict[str, float]:
     """Compute the figures of a trial, by name with their units.
 
-    `obeyed` is what a robot does of what it is told, its σ that between robots; `range_off` the spread of ranges about
+    `obeyed` is what a robot does of its command, its σ that between robots; `range_off` the spread of ranges about
     those of a level LiDAR, whose noise is 0.05 m.
     """
     period, lengths = float(np.asarray(params.vehicle.period)), np.atleast_1d(np.asarray(params.tunnel.length))
     state, n = now.state, len(now.over)
-    walked = np.asarray(state.station) - now.begun
+    walked = np.asarray(state.station) - now.start
     error = (np.asarray(state.odometry.distance) - np.abs(walked)) / np.maximum(np.abs(walked), 1.0)
-    told, done = (np.nan_to_num(part) for part in (rows.command, rows.motion))
-    total = np.sum(told * told, axis=0)
-    obeyed = np.where(total > 0.0, np.sum(told * done, axis=0) / np.maximum(total, 1e-9), np.nan)
+    commanded, done = (np.nan_to_num(part) for part in (rows.command, rows.motion))
+    total = np.sum(commanded * commanded, axis=0)
+    obeyed = np.where(total > 0.0, np.sum(commanded * done, axis=0) / np.maximum(total, 1e-9), np.nan)
     off = np.abs(rows.sway[np.isfinite(rows.sway)])
     spread = np.rad2deg(np.nanstd(rows.lean, axis=(0, 1)))
     return {

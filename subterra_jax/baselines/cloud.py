@@ -170,9 +170,9 @@ def weigh_odometer(
     rest, total = read - way * (1.0 + mean), way * way * variance + noise.step_sigma**2
     gain = way * variance / total
     learnt = jnp.stack([mean + gain * rest, variance * (1.0 - gain * way)], axis=-1)
-    told = ~jnp.isnan(turned)
-    likely = jnp.where(told, -0.5 * (rest * rest / total + jnp.log(total)), 0.0)
-    return dataclasses.replace(cloud, odometer=jnp.where(told, learnt, cloud.odometer)), likely
+    known = ~jnp.isnan(turned)
+    likely = jnp.where(known, -0.5 * (rest * rest / total + jnp.log(total)), 0.0)
+    return dataclasses.replace(cloud, odometer=jnp.where(known, learnt, cloud.odometer)), likely
 
 
 def reweight(cloud: Cloud, gain: Float[Array, "n"], params: CloudParams) -> Cloud:

@@ -22,7 +22,7 @@ from subterra_jax.baselines.exactscan import ExactParams, exact_likelihood
 from subterra_jax.baselines.navigator import Navigator
 from subterra_jax.baselines.reckoning import Reckoning, begin_reckoning, odometer_share, reckon, unobserved_distance
 from subterra_jax.baselines.scanmodel import ScanModel, TunnelPose, fit, fit_roughly, move_pose
-from subterra_jax.baselines.stations import Driven, Localiser, Station, told_start
+from subterra_jax.baselines.stations import Driven, Localiser, Station, reported_start
 from subterra_jax.baselines.steering import CentreLine, steering_of
 from subterra_jax.baselines.wallmap import WallMap, wall_map
 from subterra_jax.state import EnvParams
@@ -117,7 +117,7 @@ class HistogramLocaliser(Localiser):
             inside = (tape >= margin) & (tape <= params.tunnel.length - margin)
             log_mass = jnp.tile(jnp.where(inside, 0.0, _FLOOR), (2, 1))
         else:
-            start = told_start(obs, params)
+            start = reported_start(obs, params)
             origin = start - 0.5 * self.n_cells * self.cell
             sigma = jnp.maximum(jnp.asarray(params.start.station_sigma, jnp.float32), 0.5 * self.cell)
             log_mass = -0.5 * ((self._tape(origin) - start) / sigma)[None] ** 2

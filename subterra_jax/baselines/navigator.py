@@ -10,7 +10,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from subterra_jax.baselines.agent import Action, Known, Observed
-from subterra_jax.baselines.stations import Driven, Localiser, Station, told_start
+from subterra_jax.baselines.stations import Driven, Localiser, Station, reported_start
 from subterra_jax.baselines.steering import Steering
 from subterra_jax.state import EnvParams
 
@@ -56,7 +56,7 @@ def target_speed(mission: Mission, estimate: Station, obs: Observed, params: Env
         return jnp.where(mission.stopped, 0.0, speed_max)
     target = obs.goal
     if params.goal_kind == "return":
-        home = told_start(obs, params)
+        home = reported_start(obs, params)
         # Out until the flag is raised, wherever the goal is believed to be.
         target = jnp.where(mission.direction > 0.0, _FAR, home)
     to_go = mission.direction * (target - estimate.station)

@@ -31,7 +31,7 @@ from subterra_jax.baselines.reckoning import (
     unobserved_distance,
 )
 from subterra_jax.baselines.scanmodel import ScanModel, TunnelPose, fit, fit_roughly
-from subterra_jax.baselines.stations import Driven, Localiser, Station, told_start
+from subterra_jax.baselines.stations import Driven, Localiser, Station, reported_start
 from subterra_jax.baselines.steering import CentreLine, steering_of
 from subterra_jax.baselines.wallmap import WallMap, wall_map
 from subterra_jax.state import EnvParams
@@ -87,7 +87,7 @@ class ParticleLocaliser(Localiser):
         else:
             station_key, cloud_key = jax.random.split(cloud_key)
             spread = jnp.clip(jax.random.normal(station_key, (n,)), -3.0, 3.0)
-            station = jnp.maximum(told_start(obs, params) + params.start.station_sigma * spread, 0.0)
+            station = jnp.maximum(reported_start(obs, params) + params.start.station_sigma * spread, 0.0)
             heading = jnp.zeros_like(station)
         walls, range_max = self.walls.pick(params.tunnel), jnp.asarray(params.lidar.range_max)
         pose = fit_roughly(walls, TunnelPose(station, jnp.zeros(n), heading), obs.ranges, range_max, self.scan)

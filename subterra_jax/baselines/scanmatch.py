@@ -17,7 +17,7 @@ from subterra_jax.baselines.cloud import CloudParams, cloud_params
 from subterra_jax.baselines.navigator import Navigator
 from subterra_jax.baselines.reckoning import Reckoning, begin_reckoning, odometer_share, reckon, unobserved_distance
 from subterra_jax.baselines.scanmodel import TunnelPose, move_pose
-from subterra_jax.baselines.stations import Driven, Localiser, Station, told_start
+from subterra_jax.baselines.stations import Driven, Localiser, Station, reported_start
 from subterra_jax.baselines.steering import CentreLine, find_walls, steering_of
 from subterra_jax.lidar import bearings
 from subterra_jax.state import EnvParams
@@ -254,7 +254,7 @@ class ScanMatcher(Localiser):
         """Begins at the believed start, on an axis that is taken to be straight."""
         zero, corridor = jnp.zeros(()), find_walls(obs.ranges, params)
         half_width = 0.5 * (corridor.left + corridor.right)
-        pose = AxisPose(told_start(obs, params), corridor.offset, corridor.angle, zero, half_width)
+        pose = AxisPose(reported_start(obs, params), corridor.offset, corridor.angle, zero, half_width)
         return MatchMemory(
             profile=empty_profile(),
             faces=empty_profile() if "intensity" in obs.entries else None,

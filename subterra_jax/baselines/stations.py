@@ -49,7 +49,7 @@ def odometry_sigma(distance: Float[Array, ""], steps: Float[Array, ""], params: 
     return jnp.sqrt(variance + wander_variance(distance, odometry.wander))
 
 
-def told_start(obs: Observed, params: EnvParams) -> Float[Array, ""]:
+def reported_start(obs: Observed, params: EnvParams) -> Float[Array, ""]:
     """Return the station of the start as reported, m."""
     return jnp.asarray(params.start.station if obs.start is None else obs.start, jnp.float32)
 
@@ -59,7 +59,7 @@ def believed_start(obs: Observed, params: EnvParams) -> tuple[Float[Array, ""], 
     if params.goal_kind == "report":
         room = params.tunnel.length - 2.0 * params.goal.margin
         return 0.5 * params.tunnel.length, room / jnp.sqrt(12.0)
-    return told_start(obs, params), jnp.asarray(params.start.station_sigma, jnp.float32)
+    return reported_start(obs, params), jnp.asarray(params.start.station_sigma, jnp.float32)
 
 
 @struct.dataclass

@@ -66,15 +66,15 @@ def localisability(env: Env, params: EnvParams, step: float = 1.0, index: int = 
     there = (ranges < limit).all(axis=1)
     slope, left = fit_slopes(ranges.swapaxes(0, 1))
     slope = np.where(there & (np.abs(slope) >= LEAST_SLOPE), slope, 0.0)
-    told = np.sum(slope**2 / (range_sigma(params) ** 2 + left), axis=1)
-    more = np.zeros_like(told)
+    information = np.sum(slope**2 / (range_sigma(params) ** 2 + left), axis=1)
+    more = np.zeros_like(information)
     if "intensity" in seen:
         shown = seen["intensity"]
         slope, left = fit_slopes(shown.swapaxes(0, 1))
         noise = (SCALE_SIGMA * shown.mean(axis=1)) ** 2 + _ROUNDING
         more = np.sum(np.where(there, slope**2 / (noise + left), 0.0), axis=1)
     with np.errstate(divide="ignore"):
-        return Localisability(station, told**-0.5, (told + more) ** -0.5)
+        return Localisability(station, information**-0.5, (information + more) ** -0.5)
 
 
 def fit_slopes(values: Float[np.ndarray, "k *n"]) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:

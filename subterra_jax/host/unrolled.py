@@ -1,4 +1,4 @@
-"""A wall rolled out flat, with its recesses: points a grid apart, and their Delaunay triangles.
+"""A wall unrolled, with its recesses: points a grid apart, and their Delaunay triangles.
 
 In the plane of arc length around the section and station along the axis a recess is a rectangle. Because no other point
 comes near its rim, Delaunay's triangulation holds the rim's edges, so that recesses need no Boolean operation, which

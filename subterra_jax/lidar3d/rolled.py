@@ -1,4 +1,4 @@
-"""The surface of a shell: its wall rolled out flat, triangulated with its recesses, and rolled up again."""
+"""The surface of a shell: its wall unrolled, triangulated with its recesses, and rolled up again."""
 
 from dataclasses import replace
 

@@ -223,7 +223,7 @@ class Faults(Part):
         return advance_faults(own, seen, noise.uniform, params.lidar.n_beams, self.sizes(own, params))
 
     def look_from(self, own: FaultState, sensing: SensingState, params: EnvParams) -> SensingState:
-        """Show an earlier moment, by an odometer that did not begin at 0."""
+        """Show an earlier state, by an odometer that did not begin at 0."""
         seen = observed(own, self.sizes(own, params))
         reading = dataclasses.replace(
             sensing.parts["odometry"], distance=seen[4] + own.origin[0], heading=wrap(seen[5] + own.origin[1])

@@ -98,7 +98,7 @@ class Step:
 
 @dataclasses.dataclass(frozen=True)
 class SensingState:
-    """The moment that sensors show: the present one, or an earlier one where observations are late.
+    """The state that sensors show: the present one, or an earlier one where observations are late.
 
     Attributes:
         tunnel: Tunnel that the robot is in.
@@ -188,7 +188,7 @@ class Part(abc.ABC):
         return own
 
     def look_from(self, own: Any, sensing: SensingState, params: EnvParams) -> SensingState:
-        """Change the moment that sensors show, as a delay does."""
+        """Change the state that sensors show, as a delay does."""
         return sensing
 
     def hits(self, own: Any, sensing: SensingState, directions: Float[Array, "n_beams 2"], params: EnvParams) -> Any:

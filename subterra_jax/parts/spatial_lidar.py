@@ -35,7 +35,7 @@ class SpatialParams:
 
     Attributes:
         directions: Beams in the sensor's frame, unit vectors, row by row of the image.
-        times: Time of each beam from the moment of the observation, s, at most 0.
+        times: Time of each beam from that of the observation, s, at most 0.
         range_max: Largest range, m. A beam without a return reports exactly this.
         range_min: Least range; what is nearer gives no return, m.
         mount: Place and attitude on the robot.
@@ -169,11 +169,11 @@ class Sweeping:
 
 
 def along_arc(
-    begun: Sweeping, position: Float[Array, "2"], heading: Float[Array, ""], share: Float[Array, "n"]
+    start: Sweeping, position: Float[Array, "2"], heading: Float[Array, ""], share: Float[Array, "n"]
 ) -> tuple[Float[Array, "n 2"], Float[Array, "n"]]:
     """Return poses (m, rad) at shares of the way from one pose to another, by a constant speed and yaw rate."""
-    turn = wrap(heading - begun.heading)
-    chord_x, chord_y = position[0] - begun.position[0], position[1] - begun.position[1]
+    turn = wrap(heading - start.heading)
+    chord_x, chord_y = position[0] - start.position[0], position[1] - start.position[1]
     small = jnp.abs(turn) < 1e-3
     half = jnp.where(small, 1.0, 0.5 * turn)
     # A chord of the arc is as the sine of half its turn, and points half its turn past the first heading.
@@ -181,7 +181,7 @@ def along_arc(
     back = 0.5 * turn * (share - 1.0)
     cos, sin = size * jnp.cos(back), size * jnp.sin(back)
     x, y = cos * chord_x - sin * chord_y, sin * chord_x + cos * chord_y
-    return begun.position + jnp.stack([x, y], axis=-1), begun.heading + share * turn
+    return start.position + jnp.stack([x, y], axis=-1), start.heading + share * turn
 
 
 @dataclasses.dataclass(frozen=True)
@@ -320,13 +320,13 @@ class SpatialLidar(Part):
         """Refuse a sweep whose moments other parts do not know, and a sensor inside the wall.
 
         Raises:
-            ValueError: A part shows one moment alone.
+            ValueError: A part shows one instant alone.
             SubterraError: The sensor stands in the wall, the ground or a thing.
         """
         sensor = params.lidar
         if sensor.sweep and (late := others & {"obstacles", "faults"}):
             raise ValueError(
-                f"sweep=True does not go with the part {min(late)!r}, which knows one moment of a scan alone"
+                f"sweep=True does not go with the part {min(late)!r}, which knows one instant of a scan alone"
             )
         numbers = [np.asarray(leaf) for leaf in jax.tree.leaves((sensor.mount, sensor.echo, sensor.range_max))]
         if not all(np.all(np.isfinite(number)) for number in numbers):

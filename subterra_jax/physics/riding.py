@@ -154,11 +154,11 @@ def lidar_pose(
     place: tuple[float, float, float],
     lateral: Float[Array, ""] | float = 0.0,
 ) -> tuple[Float[Array, "3"], Float[Array, "4"]]:
-    """Return the origin (tunnel frame, m) and the rotation of a LiDAR at the moment that is shown.
+    """Return the origin (tunnel frame, m) and the rotation of a LiDAR at the state that is shown.
 
     Args:
         ride: The robot, which gives height and lean.
-        sensing: The moment, which gives position and heading; faults show an earlier one.
+        sensing: The state, which gives position and heading; faults show an earlier one.
         place: Where the LiDAR stands on the trunk, m.
         lateral: Distance to the left of there, m.
     """
@@ -235,7 +235,7 @@ def scan(
     Args:
         origin: Place of the LiDAR, tunnel frame, m.
         anchor: Row of the track nearest to it.
-        sensing: The moment that is shown.
+        sensing: The state that is shown.
         relief: The bore's surface, if there is one.
 
     Returns:

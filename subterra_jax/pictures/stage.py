@@ -167,7 +167,7 @@ def _lamps(piece: Piece) -> Float[np.ndarray, "k 3"]:
 def _wall_picture(piece: Piece, shell: Shell, seed: int) -> tuple[np.ndarray, tuple[float, float]]:
     """Return a picture of the brightness of a piece's wall, `(around, along, 3)` uint8, and its size along and around.
 
-    It is for walls rolled out as by `surfaces`; what is off the bore's usual section lies a little beside its place.
+    It is for walls unrolled as by `surfaces`; what is off the bore's usual section lies a little beside its place.
     """
     radius, own = np.median(shell.section), shell.window[0] + np.array([piece.start - AROUND, piece.end + AROUND])
     first = shell.station[shell.station >= own[0]][0] - shell.window[0]

@@ -28,7 +28,7 @@ class Surface:
     name: str  # name: `wall`, `recess`, `floor`, `rail`, `sleeper` or `furniture`
     triangles: Triangles  # vertices in the tunnel frame, m, and faces
     colour: Colour  # Red, green, blue, 0 to 1
-    # place of each vertex on the wall rolled out flat, or on the floor, m, `(v, 2)`, for a texture; `None` where there
+    # place of each vertex on the wall unrolled, or on the floor, m, `(v, 2)`, for a texture; `None` where there
     # is none
     rolled: Float[np.ndarray, "v 2"] | None = None
 

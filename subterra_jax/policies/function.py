@@ -109,7 +109,7 @@ class DrivingPolicy:
             wrong = type(memory).__name__
             raise PolicyError(f"{self.name}: the first memory is policy.initial_memory(), got a {wrong}")
         if state is None and self.agent.privileged:
-            raise PolicyError(f"{self.name}: is told the truth, so call it as policy(obs, memory, state)")
+            raise PolicyError(f"{self.name}: is given the truth, so call it as policy(obs, memory, state)")
         if state is None and count > 1:
             raise PolicyError(f"{self.name}: drives in {count} tunnels, so call it as policy(obs, memory, state)")
         return _act(self, obs, memory, state)

@@ -11,7 +11,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float
 
 from subterra_jax.baselines.agent import LIDAR_ENTRIES, Observed
-from subterra_jax.baselines.stations import told_start
+from subterra_jax.baselines.stations import reported_start
 from subterra_jax.baselines.steering import Corridor
 from subterra_jax.parts.unicycle import wrap
 from subterra_jax.state import EnvParams
@@ -71,7 +71,7 @@ def way_to_go(now: Reckoned, obs: Observed, params: EnvParams) -> Float[Array, "
     driven = obs.distance - now.distance
     if params.goal_kind in ("cover", "report"):
         return params.tunnel.length - driven
-    out = obs.goal - told_start(obs, params)
+    out = obs.goal - reported_start(obs, params)
     if params.goal_kind != "return":
         return out - driven
     return jnp.where(now.flag > 0.5, out - params.goal.flag_reach - driven, out - driven)

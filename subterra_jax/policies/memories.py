@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from subterra_jax.baselines.agent import Observed
 from subterra_jax.baselines.histogram import HistogramLocaliser
-from subterra_jax.baselines.stations import Driven, Station, believed_start, odometry_sigma, told_start
+from subterra_jax.baselines.stations import Driven, Station, believed_start, odometry_sigma, reported_start
 from subterra_jax.baselines.steering import CentreLine, Corridor
 from subterra_jax.policies import inputs
 from subterra_jax.policies.inputs import Reckoned
@@ -72,7 +72,7 @@ class Memory:
         located = None
         if self.locates:
             localiser, anywhere = given.localiser(params), params.goal_kind == "report"
-            start, sigma = believed_start(obs, params) if anywhere else (told_start(obs, params), 0.05)
+            start, sigma = believed_start(obs, params) if anywhere else (reported_start(obs, params), 0.05)
             station = Station(jnp.asarray(start, jnp.float32), jnp.log(jnp.float32(sigma)), jnp.ones(()))
             located = Located(CentreLine().begin(obs, params), jnp.ones(()), localiser.begin(obs, params), station)
         seen = self._look(reckoned, located, obs, params)
@@ -118,7 +118,7 @@ class Memory:
         target = obs.goal if params.goal_kind in ("stop", "return") else params.tunnel.length
         out = target - way
         if params.goal_kind == "return":
-            out = jnp.where(kept.reckoned.flag > 0.5, told_start(obs, params) + way, out)
+            out = jnp.where(kept.reckoned.flag > 0.5, reported_start(obs, params) + way, out)
         return out, jnp.log(jnp.float32(1.0)), jnp.where(kept.reckoned.turned, -1.0, 1.0)
 
     def _look(self, reckoned: Reckoned, located: Located | None, obs: Observed, params: EnvParams) -> Array:
@@ -133,7 +133,7 @@ class Memory:
             station, log_sigma = located.station.station, located.station.log_sigma
             way = obs.goal - station
             if params.goal_kind == "return":
-                way = jnp.where(reckoned.flag > 0.5, station - told_start(obs, params), way)
+                way = jnp.where(reckoned.flag > 0.5, station - reported_start(obs, params), way)
         seen = inputs.look(reckoned, obs, way, params, self.relief)
         return seen if located is None else self._with_place(seen, log_sigma, located.walls)
 

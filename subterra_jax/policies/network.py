@@ -141,9 +141,9 @@ class Network(nn.Module):
         if shape.way_at is not None:
             error = self.head(known)
             # The head learns by its target alone; actor and critic read what it says.
-            told = jax.lax.stop_gradient(error)
-            way = FAR * x[..., shape.way_at] + told[..., 0]
-            known = jnp.concatenate([known, scaled_way(way), told[..., 1:]], axis=-1)
+            fixed = jax.lax.stop_gradient(error)
+            way = FAR * x[..., shape.way_at] + fixed[..., 0]
+            known = jnp.concatenate([known, scaled_way(way), fixed[..., 1:]], axis=-1)
         seen = known[..., : shape.n_seen] if shape.n_seen else known
         return Outputs(self.actor(seen), self.log_std, self.critic(known)[..., 0], error)
 

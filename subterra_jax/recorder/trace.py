@@ -22,7 +22,7 @@ N_POSE = 19  # position, quaternion and joints of a robot on legs
 
 @dataclasses.dataclass(frozen=True)
 class Trace:
-    """An episode of `n` steps, on the host; row k is the moment after k periods, from 0 to n."""
+    """An episode of `n` steps, on the host; row k is the state after k periods, from 0 to n."""
 
     state: State  # states, each leaf with a leading axis of `n + 1`
     observation: Float[np.ndarray, "rows n_obs"]  # observations as the agent got them

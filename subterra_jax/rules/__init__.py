@@ -2,7 +2,7 @@
 
 from subterra_jax.rules.relocalise import Relocalise
 from subterra_jax.rules.rule import Choice, Rule, Start, StartParams, Verdict
-from subterra_jax.rules.stop import GoalParams, GoalRewardParams, StopAt, ToldParams
+from subterra_jax.rules.stop import GoalParams, GoalRewardParams, ReportParams, StopAt
 from subterra_jax.rules.traverse import RewardParams, Traverse
 from subterra_jax.rules.turn_back import TurnBack
 
@@ -11,12 +11,12 @@ __all__ = [
     "GoalParams",
     "GoalRewardParams",
     "Relocalise",
+    "ReportParams",
     "RewardParams",
     "Rule",
     "Start",
     "StartParams",
     "StopAt",
-    "ToldParams",
     "Traverse",
     "TurnBack",
     "Verdict",

@@ -69,7 +69,7 @@ class GoalRewardParams:
 
 
 @struct.dataclass
-class ToldParams:
+class ReportParams:
     """Errors of what an agent is given."""
 
     # relative error of the ring length reported against that of the tunnel's drawings, 1; for ablations
@@ -88,7 +88,7 @@ class GoalState:
 class StopState(GoalState):
     """Goal of one episode, and what is reported."""
 
-    told: Float[Array, ""]  # station of the start as reported, m
+    reported: Float[Array, ""]  # station of the start as reported, m
     pitch: Float[Array, ""]  # ring length as reported, m; 0 where there are no rings
 
 
@@ -128,23 +128,23 @@ class StopAt(GoalRule):
     goal_kind: ClassVar[str] = "stop"
 
     def defaults(self) -> dict[str, Any]:
-        return {**super().defaults(), "told": ToldParams()}
+        return {**super().defaults(), "reported": ReportParams()}
 
     def start(self, draw: tuple[Array, Array, Array], tunnel: Tunnel, params: EnvParams) -> Start:
         """Draw the distance, then the start in the room that is left, then how far the true start is off."""
-        told, goal = draw_stations(draw[1], tunnel, params.goal)
+        reported, goal = draw_stations(draw[1], tunnel, params.goal)
         offset = params.start.station_sigma * jnp.clip(draw[2], -3.0, 3.0)
-        pitch = tunnel.ring_pitch * (1.0 + params.told.pitch_error)
-        own = StopState(goal, jnp.zeros((), jnp.int32), told, pitch)
-        return Start(told + offset, **spread(draw[0], params), own=own)
+        pitch = tunnel.ring_pitch * (1.0 + params.reported.pitch_error)
+        own = StopState(goal, jnp.zeros((), jnp.int32), reported, pitch)
+        return Start(reported + offset, **spread(draw[0], params), own=own)
 
     def place(self, start: Start, choice: Choice) -> Start:
         """Return a start with a chosen place, which is reported as it is, and goal; a drawn goal keeps its distance."""
         own = start.own
-        told = chosen(choice.station, own.told)
-        goal = chosen(choice.goal, own.station + told - own.told)
+        reported = chosen(choice.station, own.reported)
+        goal = chosen(choice.goal, own.station + reported - own.reported)
         start = super().place(start, choice)
-        return dataclasses.replace(start, own=dataclasses.replace(own, station=goal, told=told))
+        return dataclasses.replace(start, own=dataclasses.replace(own, station=goal, reported=reported))
 
     def space(self, params: EnvParams) -> dict[str, Bounds]:
         """Station of the goal, nominal ring length (0 where there are no rings), and the believed start, m."""
@@ -152,7 +152,7 @@ class StopAt(GoalRule):
 
     def observe(self, state: State, tunnel: Tunnel) -> dict[str, Array]:
         own = state.goal
-        return {"goal": own.station, "ring_pitch": own.pitch, "start": own.told}
+        return {"goal": own.station, "ring_pitch": own.pitch, "start": own.reported}
 
     def judge(self, step: Step, params: EnvParams) -> Verdict:
         goal = step.before.goal

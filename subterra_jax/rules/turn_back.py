@@ -31,7 +31,7 @@ class TurnBack(StopAt):
     def start(self, draw: tuple[Array, Array, Array], tunnel: Tunnel, params: EnvParams) -> Start:
         start = super().start(draw, tunnel, params)
         own = start.own
-        goal = ReturnState(own.station, own.still, told=own.told, pitch=own.pitch, flag=jnp.zeros_like(own.told))
+        goal = ReturnState(**vars(own), flag=jnp.zeros_like(own.reported))
         return dataclasses.replace(start, own=goal)
 
     def space(self, params: EnvParams) -> dict[str, Bounds]:
@@ -48,17 +48,17 @@ class TurnBack(StopAt):
     def judge(self, step: Step, params: EnvParams) -> Verdict:
         goal = step.before.goal
         still, stopped = count_still(step, params.goal)
-        station, back = step.place.station, jnp.abs(step.place.station - goal.told)
+        station, back = step.place.station, jnp.abs(step.place.station - goal.reported)
         reached = jnp.abs(station - goal.station) <= params.goal.flag_reach
         flag = jnp.where(reached, 1.0, goal.flag)
         success = stopped & (flag > 0.5) & (back <= params.goal.tolerance)
-        to_go = _to_go(station, goal.station, goal.told, flag)
-        nearer = _to_go(step.before.station, goal.station, goal.told, goal.flag) - to_go
+        to_go = _to_go(station, goal.station, goal.reported, flag)
+        nearer = _to_go(step.before.station, goal.station, goal.reported, goal.flag) - to_go
         terms = goal_terms(
             step, params, success=success, stopped=stopped, failed=step.contact, error=to_go, nearer=nearer
         )
         after = dataclasses.replace(goal, still=still, flag=flag)
-        info = {"goal_error": station - goal.told, "stopped": stopped, "flag": flag > 0.5}
+        info = {"goal_error": station - goal.reported, "stopped": stopped, "flag": flag > 0.5}
         return Verdict(success, stopped, terms, after, info)
 
     def shortest_way(self, state: State, tunnel: Tunnel, params: EnvParams) -> Float[Array, ""]:

@@ -24,7 +24,7 @@ class ShellLining:
     # Niches are recesses.
     pocket: np.ndarray
     brick: np.ndarray  # furniture, see `make_bricks`, `(k, 13)`
-    seam: float = 1.5 * np.pi  # angle at which the wall is cut open to be rolled out flat, rad; no recess lies there
+    seam: float = 1.5 * np.pi  # angle at which the wall is cut open to be unrolled, rad; no recess lies there
     radius: np.ndarray | None = None  # section of this variant, m, `(n, m)`; `None` where it is the shell's
 
 
@@ -37,7 +37,7 @@ class Shell:
     tangent: np.ndarray  # unit vectors of growing station, with the grade, `(n, 3)`
     angle: np.ndarray  # directions around the axis, uniform and growing over one turn less a step, rad, `(m,)`
     radius: np.ndarray  # distance of the smooth wall from the axis, m, `(n, m)`
-    section: np.ndarray  # mean section, by which the wall is rolled out flat, m, `(m,)`
+    section: np.ndarray  # mean section, by which the wall is unrolled, m, `(m,)`
     track: np.ndarray  # rails, sleepers and slab of every variant, see `make_bricks`, `(t, 13)`
     linings: dict[str, ShellLining]  # variant name to what it adds
     spacing: tuple[float, float] = SPACING  # distance of the points of the triangulated wall, along and around, m

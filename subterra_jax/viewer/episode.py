@@ -27,7 +27,7 @@ _NO_LINES = np.zeros((0, 2, 3))
 
 @dataclasses.dataclass(frozen=True)
 class Drawn:
-    """An episode to draw. Row k of a series is the moment after k periods."""
+    """An episode to draw. Row k of a series is the state after k periods."""
 
     centreline: Centreline  # its tunnel
     trace: Trace  # the episode

@@ -93,7 +93,7 @@ def warning(code: str, start: float | None = None, end: float = 0.0) -> dict[str
 
 
 @pytest.mark.parametrize(
-    ("kind", "place", "said", "told"),
+    ("kind", "place", "said", "warned"),
     [
         ("floor", 10.0, warning(Code.UNSEEN, 7.0, 9.0), True),
         ("floor", 10.0, warning(Code.UNSEEN, 12.0, 15.0), False),
@@ -108,10 +108,10 @@ def warning(code: str, start: float | None = None, end: float = 0.0) -> dict[str
     ],
 )
 def test_a_warning_excuses_the_faults_of_its_code_at_its_place_and_no_other(
-    kind: str, place: float, said: dict, told: bool
+    kind: str, place: float, said: dict, warned: bool
 ) -> None:
     fault = Fault(kind, "x", place)
-    assert judge_build({**ROW, "warnings": [said]}, [fault]) == (WARNED if told else VAGUE)
+    assert judge_build({**ROW, "warnings": [said]}, [fault]) == (WARNED if warned else VAGUE)
     assert judge_build({**ROW, "warnings": []}, [fault]) == SILENT
 
 

@@ -181,10 +181,10 @@ def inputs(tmp_path_factory):
 def test_bad_input_is_one_sentence_status_2_and_no_output(case, inputs, tmp_path, command):
     arguments, sentence = inputs[case]
     out = tmp_path / "scene"
-    status, told = command(*arguments, "--out", out)
-    assert status == 2, told
-    lines = [line for line in told.splitlines() if line.strip()]
-    assert len(lines) == 1, told
+    status, outcome = command(*arguments, "--out", out)
+    assert status == 2, outcome
+    lines = [line for line in outcome.splitlines() if line.strip()]
+    assert len(lines) == 1, outcome
     assert re.search(rf"^error: .*{sentence}", lines[0]), lines[0]
     assert not list(tmp_path.iterdir())
 

@@ -58,8 +58,8 @@ def test_sizes_of_no_tunnel_name_the_unit_that_would_make_one(bore, by, said):
 
 
 def test_a_cm_cloud_taken_as_mm_is_told_by_its_size(bore):
-    told = codes(scaled(bore, 0.1), {"unit": "mm (detected: least extent 550)"})["size"]
-    assert "--unit cm makes it 5.6 m by 6 m" in told
+    outcome = codes(scaled(bore, 0.1), {"unit": "mm (detected: least extent 550)"})["size"]
+    assert "--unit cm makes it 5.6 m by 6 m" in outcome
 
 
 def test_a_size_that_the_user_told_is_not_doubted(bore):
@@ -86,8 +86,8 @@ def test_a_round_bore_along_z_is_a_shaft_and_one_with_a_floor_a_guess(bore):
     guessed = {**METRES, "axes": "x-zy (detected: longest along z, so y is taken as up)"}
     assert "taken as up" in codes(bore, guessed)["axes"]
     tube = replace(bore, radius=np.full_like(bore.radius, 3.0))
-    told = codes(tube, guessed)["shaft"]
-    assert re.search(r"a vertical shaft, \d+ m along z .*--axes x-zy.*REFUSES", told)
+    outcome = codes(tube, guessed)["shaft"]
+    assert re.search(r"a vertical shaft, \d+ m along z .*--axes x-zy.*REFUSES", outcome)
     assert "shaft" not in codes(tube, {**METRES, "axes": "x-zy (by flag)"})
 
 
@@ -95,8 +95,8 @@ def test_a_duct_that_was_taken_for_the_crown_dents_the_section(bore):
     dented = bore.radius.copy()
     near = np.abs(bore.angle - np.pi / 2) < 0.2
     dented[20:60, near] -= 0.9
-    told = codes(replace(bore, radius=dented))["dent"]
-    assert re.search(r"from 5 to 15 m the section is dented inwards by up to 0\.[89] m at the crown", told)
+    outcome = codes(replace(bore, radius=dented))["dent"]
+    assert re.search(r"from 5 to 15 m the section is dented inwards by up to 0\.[89] m at the crown", outcome)
     shallow = bore.radius.copy()
     shallow[20:60, near] -= 0.1
     assert codes(replace(bore, radius=shallow)) == {}
@@ -113,8 +113,8 @@ def test_what_nobody_measured_is_said(bore):
     facts = {**METRES, "calibration": "none: the control is taken for the LiDAR's own origin"}
     assert "--calibration" in codes(bore, facts)["calibration"]
     assert "nothing measured the length" in codes(bore, {"length_fixed_by": "odometry; nothing measured it"})["length"]
-    told = codes(bore, METRES, {"pockets": "by standard", "rings": "by standard"})["by_standard"]
-    assert f"{len(bore.ring_station)} rings and {len(bore.pocket)} pockets" in told
+    outcome = codes(bore, METRES, {"pockets": "by standard", "rings": "by standard"})["by_standard"]
+    assert f"{len(bore.ring_station)} rings and {len(bore.pocket)} pockets" in outcome
     assert not doubt_bore(bore, METRES, {"pockets": "by standard"}, surveyed=False)
 
 
@@ -183,9 +183,9 @@ def test_a_wall_that_two_passes_show_twice_is_told(bore, apart, said):
     first, second = (np.array(on_wall(bore, 60_000, seed=seed)) for seed in (1, 2))
     second[1:] += np.array([[0.8 * apart], [0.6 * apart]])
     points = [about(bore, *part) + 0.004 * rng.standard_normal((60_000, 3)) for part in (first, second)]
-    told = doubt_layers(bore, cloud_of(*points))
-    assert [warning.code for warning in told] == ([] if said is None else ["doubled"])
-    assert said is None or re.search(said, told[0].text)
+    outcome = doubt_layers(bore, cloud_of(*points))
+    assert [warning.code for warning in outcome] == ([] if said is None else ["doubled"])
+    assert said is None or re.search(said, outcome[0].text)
 
 
 def test_panels_side_by_side_are_no_second_wall(bore):

@@ -175,9 +175,9 @@ def test_a_lining_that_goes_on_beyond_an_end_is_told_and_a_cutting_is_not(bore, 
     kept = overhead | (radius * np.sin(angle) < 0.5)  # floor and foot of the walls alone
     more = about(bore, before[kept], (radius * np.cos(angle))[kept], (radius * np.sin(angle))[kept])
     warnings = judge_bore(bore, cloud_of(wall, more), JudgingConfig()).warnings
-    told = [warning.text for warning in warnings if warning.code == "cut_short"]
-    assert bool(told) == said
-    assert not said or "goes on for at least 7 m before station 0 m" in told[0]
+    outcome = [warning.text for warning in warnings if warning.code == "cut_short"]
+    assert bool(outcome) == said
+    assert not said or "goes on for at least 7 m before station 0 m" in outcome[0]
 
 
 def test_a_large_part_of_the_cloud_beyond_the_ends_is_told(bore, wall):

@@ -12,8 +12,8 @@ from tests.scene.conventions import sweeps, write_convention
 from tests.scene.messages import pointcloud2, write_bag1
 
 
-def read(path, **told) -> tuple[list[Scan], dict]:
-    with Recording(path, times=TimeConfig(**told)) as recording:
+def read(path, **given) -> tuple[list[Scan], dict]:
+    with Recording(path, times=TimeConfig(**given)) as recording:
         return list(recording.scans()), recording.facts
 
 

@@ -143,8 +143,8 @@ def test_a_ring_survey_in_german_and_one_whose_columns_are_named(tmp_path):
     assert read_ring_survey(path).reversed().names == ["5", "4", "3", "2", "1", "0"]
     odd = tmp_path / "odd.csv"
     odd.write_text("\n".join(["R;P;U;V;W", *ring_rows()]))
-    told = {"x": "U", "y": "V", "z": "W", "ring": "R", "point": "P"}
-    np.testing.assert_array_equal(read_ring_survey(odd, told=told).points, read_ring_survey(path).points)
+    columns = {"x": "U", "y": "V", "z": "W", "ring": "R", "point": "P"}
+    np.testing.assert_array_equal(read_ring_survey(odd, given=columns).points, read_ring_survey(path).points)
 
 
 def test_a_cloud_with_numbers_of_points_is_no_ring_survey(tmp_path):

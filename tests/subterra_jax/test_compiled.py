@@ -141,7 +141,7 @@ def test_replacing_params_by_python_numbers_compiles_nothing_anew():
 @pytest.mark.parametrize("horizon", [50.5, float("nan"), float("inf")])
 def test_replacing_a_count_by_a_fraction_is_refused(horizon):
     _, params = st.make("Subterra/TraverseShort-v1")
-    with pytest.raises(ValueError, match=f"a whole number is wanted, got {horizon}"):
+    with pytest.raises(ValueError, match=f"a whole number is needed, got {horizon}"):
         params.replace(horizon=horizon)
     assert int(params.replace(horizon=50.0).horizon) == 50
 

@@ -32,14 +32,14 @@ def _begin():
     return jax.jit(jax.vmap(begin, (0, None)))
 
 
-def begun(params, n=N):
+def fresh(params, n=N):
     return _begin()(jax.random.split(jax.random.key(0), n), params)
 
 
 def run(params, steps, n=N):
     """States after each step, with the time as row of `seen`."""
     advance = jax.jit(jax.vmap(faults.advance_faults, (0, None, 0, None, None)), static_argnums=3)
-    state, kept = begun(params, n), []
+    state, kept = fresh(params, n), []
     for k in range(steps):
         draw = jax.random.uniform(jax.random.key(10 + k), (n, 5 + BEAMS))
         state = advance(state, jnp.full(6, k + 1.0), draw, BEAMS, params)
@@ -53,7 +53,7 @@ def each(function, axes):
 
 
 def test_every_severity_is_drawn_alike():
-    severity = np.asarray(begun(faults.FaultParams()).severity)
+    severity = np.asarray(fresh(faults.FaultParams()).severity)
     counts = np.array([(severity == k).sum() for k in range(5)])
     assert counts.sum() == N
     assert np.abs(counts - N / 5).max() < 4 * np.sqrt(N * 0.2 * 0.8)
@@ -75,7 +75,7 @@ def test_dust_reflects_the_stated_share_of_beams_somewhere_before_the_wall():
     params = dataclasses.replace(ZERO, dust_rate=0.15)
     draw = jax.random.uniform(jax.random.key(5), (N, 5 + BEAMS))
     ranges = np.full((N, BEAMS), 3.0, np.float32)
-    corrupted = each(faults.corrupt, (0, 0, 0, None, None))(ranges, begun(params), draw, np.float32(30.0), params)
+    corrupted = each(faults.corrupt, (0, 0, 0, None, None))(ranges, fresh(params), draw, np.float32(30.0), params)
     short = np.asarray(corrupted)[np.asarray(corrupted) < 3.0]
     assert abs(short.size / corrupted.size - 0.15) < 4 * np.sqrt(0.15 * 0.85 / corrupted.size)
     assert abs(short.mean() - 1.5) < 4 * 3.0 / np.sqrt(12 * short.size)
@@ -123,7 +123,7 @@ def test_observations_are_as_late_as_the_severity_says():
 
 def test_wet_rail_takes_the_stated_share_of_the_speed_in_whole_patches():
     params = dataclasses.replace(ZERO, wet_share=0.3)
-    state = jax.tree.map(lambda leaf: leaf[0], begun(params, 1))
+    state = jax.tree.map(lambda leaf: leaf[0], fresh(params, 1))
     places = np.arange(0.0, 20_000.0, 2.5, np.float32)
     grip = np.asarray(each(faults.grip, (None, 0, None))(state, places, params))
     assert set(np.unique(grip)) == {np.float32(0.7), np.float32(1.0)}

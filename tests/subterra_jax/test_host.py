@@ -297,8 +297,8 @@ def test_a_checkpoint_of_another_version_says_what_to_do(tmp_path):
     checkpoint.save_checkpoint(tmp_path, 3, {"policy": {"w": np.zeros(2, np.float32)}}, {"task": "t"})
     (facts,) = tmp_path.rglob(checkpoint.FACTS)
     name, _, number = checkpoint.SCHEMA.rpartition("/")
-    for told, says in ((int(number) - 1, "older .*--overwrite"), (int(number) + 1, "newer .* --upgrade")):
-        facts.write_text(json.dumps({**json.loads(facts.read_text()), "schema": f"{name}/{told}"}))
+    for outcome, says in ((int(number) - 1, "older .*--overwrite"), (int(number) + 1, "newer .* --upgrade")):
+        facts.write_text(json.dumps({**json.loads(facts.read_text()), "schema": f"{name}/{outcome}"}))
         with pytest.raises(CheckpointError, match=says):
             checkpoint.load_checkpoint(tmp_path)
 

@@ -38,8 +38,8 @@ def begin(id, n=N, **overrides):
 def test_a_hidden_start_is_off_by_three_metres_and_a_known_one_by_nothing():
     _, _, known = begin("Subterra/StopAt-v1")
     _, _, hidden = begin("Subterra/StopAt-v1", hidden_start=True)
-    np.testing.assert_allclose(known.station, known.goal.told, rtol=1e-6)
-    off = np.asarray(hidden.station - hidden.goal.told)
+    np.testing.assert_allclose(known.station, known.goal.reported, rtol=1e-6)
+    off = np.asarray(hidden.station - hidden.goal.reported)
     assert off.std() == pytest.approx(2.97, rel=0.06)  # cut off at three standard deviations
     assert abs(off.mean()) < 0.25
     assert np.abs(off).max() <= 9.001
@@ -52,16 +52,16 @@ def test_the_way_back_ends_at_the_station_that_was_told():
     stands = lambda where: env.step(  # noqa: E731
         jax.random.key(1), state.replace(station=where, parts=raised), jnp.zeros(2), params
     )[-1]["goal_error"]
-    assert float(stands(state.station)) == pytest.approx(float(state.station - state.goal.told), abs=0.02)
+    assert float(stands(state.station)) == pytest.approx(float(state.station - state.goal.reported), abs=0.02)
 
 
 def test_a_chosen_start_is_told_and_keeps_the_distance_of_the_goal():
     env, params = st.make("Subterra/StopAt-v1", tunnel="control", hidden_start=True)
     draws = env.draw_reset(jax.random.key(0), (), params)
     drawn, placed = env.begin(draws, params), env.begin({**draws, "choice": Choice(station=50.0)}, params)
-    assert float(placed.station) == float(placed.goal.told) == 50.0
+    assert float(placed.station) == float(placed.goal.reported) == 50.0
     kept = float(placed.goal.station) - 50.0
-    assert kept == pytest.approx(float(drawn.goal.station - drawn.goal.told), abs=1e-3)
+    assert kept == pytest.approx(float(drawn.goal.station - drawn.goal.reported), abs=1e-3)
 
 
 def test_a_heading_counts_where_a_task_draws_the_direction():
@@ -77,7 +77,7 @@ def test_a_heading_counts_where_a_task_draws_the_direction():
     np.testing.assert_allclose(both(keys, Choice(station=20.0, heading=0.0)), 1.0, atol=1e-4)
 
 
-@pytest.mark.parametrize(("task", "field"), [("Subterra/Return-v1", "told"), ("Subterra/Relocalise-v1", "station")])
+@pytest.mark.parametrize(("task", "field"), [("Subterra/Return-v1", "reported"), ("Subterra/Relocalise-v1", "station")])
 def test_a_rule_whose_state_depends_on_the_start_brings_it_along(task, field):
     made, params = st.make(task, tunnel="control")
     draws = {**made.draw_reset(jax.random.key(0), (), params), "choice": Choice(station=17.0)}
@@ -87,8 +87,8 @@ def test_a_rule_whose_state_depends_on_the_start_brings_it_along(task, field):
 
 
 def test_an_ablation_may_tell_a_wrong_ring_length():
-    told = st.rules.ToldParams(pitch_error=0.01)
-    env, params = st.make("Subterra/StopAt-v1", tunnel="subterra-351", told=told)
+    reported = st.rules.ReportParams(pitch_error=0.01)
+    env, params = st.make("Subterra/StopAt-v1", tunnel="subterra-351", reported=reported)
     flat, _ = env.reset(jax.random.key(0), params)
     pitch = float(flat[env.fields(params)["ring_pitch"]][0])
     assert pitch == pytest.approx(1.01 * float(params.tunnel.ring_pitch))
@@ -212,9 +212,9 @@ class Listener:
         return FusedCount().begin(obs, params), jnp.zeros(())
 
     def update(self, memory: Any, obs: Any, driven: Any, params: Any, known: Any) -> Any:
-        told, counted = FusedCount().update(memory[0], obs, driven, params, known)
-        wrong = memory[1] + 0.02 * (obs.entries["gossip"][0] - told.station - memory[1])
-        return told.replace(station=told.station + wrong), (counted, wrong)
+        reported, counted = FusedCount().update(memory[0], obs, driven, params, known)
+        wrong = memory[1] + 0.02 * (obs.entries["gossip"][0] - reported.station - memory[1])
+        return reported.replace(station=reported.station + wrong), (counted, wrong)
 
 
 def test_a_station_told_with_a_metre_of_noise_is_noticed_above_the_floor():

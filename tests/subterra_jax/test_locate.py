@@ -85,8 +85,8 @@ def test_a_robot_makes_the_metres_of_its_training(front, with_map):
     if strip is not None:
         age = jnp.arange(1.0, n + 1.0)
         passed, rate = memory.passed(whole, age), memory.log_rate(whole, age)
-        seen, told, sure = streams.profiles_of(record, n), jnp.float32(3.0), jnp.float32(0.0)
-        beliefs = map_filter.sequence(weights["map"], seen, streams.BEFORE, strip.pick(0), told, sure, passed, rate)
+        seen, reported, sure = streams.profiles_of(record, n), jnp.float32(3.0), jnp.float32(0.0)
+        beliefs = map_filter.sequence(weights["map"], seen, streams.BEFORE, strip.pick(0), reported, sure, passed, rate)
         whole = jax.vmap(map_filter.corrected, (0, 0, 0, None))(beliefs, whole, age, sure)
     params = SimpleNamespace(
         goal_kind="stop",
@@ -199,15 +199,15 @@ def test_a_way_back_begins_at_the_place_that_the_flag_tells():
     assert stations[139] == pytest.approx(stations[70] - 0.2 * 69, abs=0.4)
 
 
-def _beliefs(weights, share, told, sigma, strip, passed):
+def _beliefs(weights, share, reported, sigma, strip, passed):
     record = jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype != bool else x, drive_past(share))
-    return _sequence(weights, record, strip, np.float32(told), np.float32(sigma), passed)
+    return _sequence(weights, record, strip, np.float32(reported), np.float32(sigma), passed)
 
 
 @jax.jit
-def _sequence(weights, record, strip, told, sigma, passed):
+def _sequence(weights, record, strip, reported, sigma, passed):
     whole, rate = streams.profiles_of(record, N_METRES), jnp.zeros(N_METRES)
-    beliefs = map_filter.sequence(weights, whole, streams.BEFORE, strip.pick(0), told, sigma, passed, rate)
+    beliefs = map_filter.sequence(weights, whole, streams.BEFORE, strip.pick(0), reported, sigma, passed, rate)
     return beliefs, map_filter.place(jax.tree.map(lambda leaf: leaf[-1], beliefs))
 
 
@@ -243,8 +243,8 @@ def test_a_map_of_another_tunnel_is_not_believed():
 def test_a_belief_widens_as_the_localiser_says_and_the_truth_is_looked_up_between_its_cells():
     weights = map_filter.init(jax.random.key(0)) | {"leak": jnp.array(-30.0)}
     two_metres = jnp.zeros(len(map_filter.SHIFTS)).at[map_filter.SIDE + 10].set(1.0)
-    begun = map_filter.MapBelief(two_metres, jnp.zeros(()))
-    now = map_filter.advance(weights, begun, jnp.zeros_like(two_metres), jnp.float32(0.5))
+    fresh = map_filter.MapBelief(two_metres, jnp.zeros(()))
+    now = map_filter.advance(weights, fresh, jnp.zeros_like(two_metres), jnp.float32(0.5))
     assert np.asarray(now.share) @ (map_filter.SHIFTS - 2.0) ** 2 == pytest.approx(0.003 * np.e, rel=1e-3)
     beside = 0.003 * np.e / map_filter.CELL**2 / 2
     found = [float(map_filter.likelihood(now, jnp.float32(2.05), jnp.asarray(right))) for right in (True, False)]

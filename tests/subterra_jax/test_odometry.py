@@ -31,7 +31,7 @@ def test_without_errors_the_observed_odometry_is_the_path_driven():
     assert float(obs[17]) == pytest.approx(float(state.heading) - start, abs=1e-5)
 
 
-def begun(part, noise, **params):
+def fresh(part, noise, **params):
     """State of a part at the start of an episode, from its draw."""
     env, made = st.make("Subterra/StopAtShort-v1", tunnel="control")
     state = jax.eval_shape(env.reset, jax.random.key(0), made)[1]
@@ -41,20 +41,20 @@ def begun(part, noise, **params):
 def test_every_error_of_an_episode_has_a_draw_of_its_own():
     params = odometry.OdometryParams(0.0, 0.02, 0.0, 0.002, WanderParams(sigma=0.01), backward_bias_sigma=0.02)
     noise = jax.random.normal(jax.random.key(4), (N, params.n_reset_noise))
-    state = jax.vmap(lambda row: begun(odometry.Odometer(), row, odometry=params))(noise)
+    state = jax.vmap(lambda row: fresh(odometry.Odometer(), row, odometry=params))(noise)
     errors = np.corrcoef([state.distance_bias, state.heading_bias, state.wander, state.backward_bias])
     np.testing.assert_allclose(errors, np.eye(4), atol=4.5 / np.sqrt(N))  # of independent numbers: 1 / sqrt(N)
 
 
 def test_distance_and_heading_have_noise_of_their_own():
     params = odometry.OdometryParams(0.01, 0.0, 0.001, 0.0)
-    state = begun(odometry.Odometer(), jnp.zeros(2), odometry=params)
+    state = fresh(odometry.Odometer(), jnp.zeros(2), odometry=params)
     after = [odometry.advance_odometry(state, jnp.zeros(2), jnp.float32(0.1), row, params) for row in jnp.eye(2)]
     np.testing.assert_allclose([[one.distance, one.heading] for one in after], [[0.01, 0.0], [0.0, 0.001]], rtol=1e-6)
 
 
 def test_dead_reckoned_headings_stay_within_half_a_turn():
-    state = begun(odometry.Odometer(), jnp.zeros(2), odometry=odometry.OdometryParams())
+    state = fresh(odometry.Odometer(), jnp.zeros(2), odometry=odometry.OdometryParams())
     for _ in range(60):
         state = odometry.advance_odometry(
             state, jnp.array([0.0, 1.5]), jnp.float32(0.1), jnp.zeros(2), odometry.OdometryParams()
@@ -88,7 +88,7 @@ def test_the_size_of_the_steps_does_not_matter_to_a_wandering_error():
 
 def test_slips_have_the_stated_spread_and_each_a_draw_of_its_own():
     noise = jax.random.normal(jax.random.key(1), (N, 3))
-    states = jax.vmap(lambda row: begun(slip.Slip(), row, slip=slip.SlipParams()))(noise)
+    states = jax.vmap(lambda row: fresh(slip.Slip(), row, slip=slip.SlipParams()))(noise)
     motion = np.asarray(jax.vmap(slip.true_motion, (None, 0))(jnp.array([2.0, 0.1]), states), np.float64)
     for channel, expected in enumerate((2.0 * np.hypot(0.02, 0.02), 0.002)):
         assert abs(motion[:, channel].std() - expected) < 3 * expected / np.sqrt(2 * N)
@@ -97,7 +97,7 @@ def test_slips_have_the_stated_spread_and_each_a_draw_of_its_own():
 
 
 def test_a_robot_told_to_stand_stands():
-    state = begun(slip.Slip(), jnp.array([3.0, 3.0, 3.0]), slip=slip.SlipParams())
+    state = fresh(slip.Slip(), jnp.array([3.0, 3.0, 3.0]), slip=slip.SlipParams())
     np.testing.assert_array_equal(slip.true_motion(jnp.zeros(2), state), np.zeros(2))
 
 

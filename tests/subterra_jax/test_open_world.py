@@ -93,8 +93,8 @@ def test_the_nominal_ring_length_is_told_and_the_built_one_is_a_little_longer(ki
     assert np.mean(spread) == pytest.approx(1e-3, rel=0.1)
     tunnel = plan(name_of(kind), solid=False, length=120.0)
     rings = draw(name_of(kind), 120.0).bore.rings
-    told = st.make("Subterra/StopAtShort-v1", tunnel=tunnel)[1].tunnel.ring_pitch  # the entry of the observation
-    assert float(told) == pytest.approx(rings.nominal, abs=1e-6)
+    outcome = st.make("Subterra/StopAtShort-v1", tunnel=tunnel)[1].tunnel.ring_pitch  # the entry of the observation
+    assert float(outcome) == pytest.approx(rings.nominal, abs=1e-6)
 
 
 def test_nothing_is_placed_where_a_sensor_looks():

@@ -167,9 +167,9 @@ def test_an_odometer_weighed_apart_learns_its_error_and_tells_ways_of_other_leng
         total += likely
     mean, variance = cloud.odometer.T
     # 400 readings of 5 % each: the mean of what they say and of 0 ± 2 %.
-    told, prior = 400.0 / 0.05**2, 1.0 / 0.02**2
-    assert float(mean[0]) == pytest.approx(0.02 * told / (told + prior), rel=0.01)
-    assert float(variance[0]) == pytest.approx(1.0 / (told + prior), rel=0.01)
+    information, prior = 400.0 / 0.05**2, 1.0 / 0.02**2
+    assert float(mean[0]) == pytest.approx(0.02 * information / (information + prior), rel=0.01)
+    assert float(variance[0]) == pytest.approx(1.0 / (information + prior), rel=0.01)
     assert float(total[0] - total[1]) > 5.0, "a way 10 % longer asks for an odometer four standard deviations off"
     stands, nothing = weigh_odometer(cloud, step, jnp.zeros(()), jnp.asarray(jnp.nan), motion)
     np.testing.assert_array_equal(stands.odometer, cloud.odometer)

@@ -80,9 +80,9 @@ def keep_all(now, taken, params):
 def test_the_function_drives_the_very_episode_that_the_evaluation_drives(name, world):
     env, params = world
     policy, driver = load_policy(name, env, params), Driver(env, keep=keep_all)
-    begun = driver.begin(params, policy.agent, 5)
-    _, kept = driver.go(params, policy.agent, begun, 0, 12)
-    memory = policy.initial_memory(begun.agent_key)
+    first = driver.begin(params, policy.agent, 5)
+    _, kept = driver.go(params, policy.agent, first, 0, 12)
+    memory = policy.initial_memory(first.agent_key)
     for k in range(12):
         state = jax.tree.map(lambda leaf, k=k: leaf[k], kept["state"]) if name == "oracle" else None
         action, memory = policy(kept["obs"][k], memory, state)
@@ -254,7 +254,7 @@ def test_a_call_that_lacks_something_is_refused_in_one_sentence(world):
         with pytest.raises(PolicyError, match=r"fused: the first memory is policy.initial_memory\(\), got a"):
             policy(jnp.zeros(21), wrong)
     oracle = load_policy("oracle", env, params)
-    with pytest.raises(PolicyError, match=r"oracle: is told the truth, so call it as policy\(obs, memory, state\)"):
+    with pytest.raises(PolicyError, match=r"oracle: is given the truth, so call it as policy\(obs, memory, state\)"):
         oracle(jnp.zeros(21), oracle.initial_memory())
     several = st.make(TASK, tunnel=["subterra-351", "control"], lining="smooth")
     policy = load_policy("fused", *several)

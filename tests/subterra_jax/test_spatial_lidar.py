@@ -100,14 +100,14 @@ def test_a_batch_in_several_tunnels_sees_what_each_robot_sees_alone(graded):
 def test_a_way_in_a_sweep_is_the_arc_that_the_robot_drives():
     from subterra_jax.parts.unicycle import follow_arc
 
-    begun = Sweeping(jnp.array([1.0, 2.0]), jnp.float32(3.0))
+    fresh = Sweeping(jnp.array([1.0, 2.0]), jnp.float32(3.0))
     for command in ([1.5, 0.35], [2.0, 0.0], [0.0, 1.0], [1.0, 1e-6]):
         motion = jnp.array(command)
-        position, heading = follow_arc(begun.position, begun.heading, motion, jnp.float32(0.1))
+        position, heading = follow_arc(fresh.position, fresh.heading, motion, jnp.float32(0.1))
         share = jnp.linspace(0.0, 1.0, 5)
-        places, headings = along_arc(begun, position, heading, share)
+        places, headings = along_arc(fresh, position, heading, share)
         for k in range(5):
-            place, turned = follow_arc(begun.position, begun.heading, motion, 0.1 * share[k])
+            place, turned = follow_arc(fresh.position, fresh.heading, motion, 0.1 * share[k])
             np.testing.assert_allclose(places[k], place, atol=2e-6)
             np.testing.assert_allclose(np.cos(headings[k] - turned), 1.0, atol=1e-6)
 
@@ -287,7 +287,7 @@ def test_what_no_sensor_can_honour_is_one_sentence(graded, tmp_path):
     ):
         with pytest.raises(ValueError, match=says):
             st.make(TASK, tunnel=graded, sensor=wrong)
-    with pytest.raises(ValueError, match="'planar16' measures a scan at one moment"):
+    with pytest.raises(ValueError, match="'planar16' measures a scan at one instant"):
         st.make(TASK, tunnel=graded, sweep=True)
     with pytest.raises(ValueError, match="sweep=True does not go with the part 'faults'"):
         st.make("Subterra/Faulted-v1", tunnel=graded, sensor=ahead, sweep=True)

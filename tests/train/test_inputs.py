@@ -160,14 +160,14 @@ def test_a_filter_on_the_map_reports_what_it_believes_in_training_as_in_driving(
         first = begin(env, driver, policy, params, jax.random.PRNGKey(1), 2)
         state = jax.tree.map(lambda leaf: leaf[0], first.env_state)
         obs = observed(env, params, env.observe(state, env.draw_step(jax.random.PRNGKey(5), (), params), params))
-        told, _ = agent.act(None, agent.begin(None, obs, params), obs, params, None)
-        return driver.act(jnp.zeros((2, 2)), first.kept, params), told
+        outcome, _ = agent.act(None, agent.begin(None, obs, params), obs, params, None)
+        return driver.act(jnp.zeros((2, 2)), first.kept, params), outcome
 
-    action, told = answers(params, policy)
+    action, outcome = answers(params, policy)
     assert action.shape == (2, 5)
-    assert jnp.exp(told[3]) > 5.0  # one scan does not tell the place
-    assert 0.0 < told[2] < params.tunnel.length
-    np.testing.assert_allclose(jnp.exp(action[0, 3]), jnp.exp(told[3]), rtol=0.5)
+    assert jnp.exp(outcome[3]) > 5.0  # one scan does not tell the place
+    assert 0.0 < outcome[2] < params.tunnel.length
+    np.testing.assert_allclose(jnp.exp(action[0, 3]), jnp.exp(outcome[3]), rtol=0.5)
 
 
 def test_a_localiser_drives_in_training_as_in_an_agent(plan):

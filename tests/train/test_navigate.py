@@ -123,8 +123,8 @@ def test_a_policy_learnt_on_the_stand_in_drives_robots_on_legs(tmp_path):
     assert navigate.command(read_command(["--out", str(out), *words, "--evaluation-episodes", "50"])) == 0
     asked = b2_traverse.Command(robots=4, agent=str(out), engine="mujoco", length=60.0, out=tmp_path / "legs.json")
     b2_traverse.command(asked)
-    told = {record.id.rpartition("/")[2]: record.value for record in read_records(asked.out)}
-    assert (told["success"], told["fall"], told["robots"]) == (100.0, 0.0, 4.0)
+    outcome = {record.id.rpartition("/")[2]: record.value for record in read_records(asked.out)}
+    assert (outcome["success"], outcome["fall"], outcome["robots"]) == (100.0, 0.0, 4.0)
 
 
 N_SEEN, N_TRUTH = 56, 12

@@ -72,7 +72,7 @@ def test_the_settings_of_a_run_are_read_back_as_they_were(tmp_path, words):
 
 @pytest.mark.slow
 def test_a_run_is_done_again_from_its_own_config(train_small, tmp_path):
-    (tmp_path / "told.py").write_text("lines = []\ndef keep(line):\n    lines.append(line)\n")
+    (tmp_path / "outcome.py").write_text("lines = []\ndef keep(line):\n    lines.append(line)\n")
     few = (
         "--steps=8192",
         "--stop-coverage=2",
@@ -84,14 +84,14 @@ def test_a_run_is_done_again_from_its_own_config(train_small, tmp_path):
         "--evaluation-episodes",
         "5",
     )
-    status, first = train_small(*few, "--log", f"{tmp_path / 'told.py'}:keep")
+    status, first = train_small(*few, "--log", f"{tmp_path / 'outcome.py'}:keep")
     assert status == 0
     assert call(navigate.main, "--config", str(first / "config.json"), "--out", str(tmp_path / "again")) == 0
     assert log_without_timing(tmp_path / "again") == log_without_timing(first)
-    (module,) = [module for name, module in sys.modules.items() if name.startswith("told_")]
+    (module,) = [module for name, module in sys.modules.items() if name.startswith("outcome_")]
     assert [line["iteration"] for line in module.lines] == [1, 2, 1, 2]
-    told = json.loads((first / "config.json").read_text())
-    assert told["reward"] == {"coverage": 7.0}
+    outcome = json.loads((first / "config.json").read_text())
+    assert outcome["reward"] == {"coverage": 7.0}
     # The reward is how it was taught, and no condition under which it drives.
     env, params = st.make(TASK)
     assert load_policy(first, env, params).agent.layout.memory.frames == 2

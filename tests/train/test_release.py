@@ -212,13 +212,13 @@ def test_the_command_prints_one_line_of_json_and_nothing_else(trained, tunnel, c
 def test_an_ablation_takes_away_what_it_names_and_nothing_else():
     env, params = st.make("Subterra/StopAtShort-v1", tunnel="open:cast:train:0")
     flat, _ = env.reset(jax.random.key(0), params)
-    begun = observed(env, params, flat)
-    obs = dataclasses.replace(begun, distance=begun.distance + 5.0)
+    fresh = observed(env, params, flat)
+    obs = dataclasses.replace(fresh, distance=fresh.distance + 5.0)
     driver = Driver(env, make_layout(env, params, TrainConfig(hidden=(4,))))
     agent = make_agent(driver, Policy(driver.init(jax.random.PRNGKey(0))))
 
     def reads(agent):
-        act = jax.jit(lambda obs: agent.act(None, agent.begin(None, begun, params), obs, params, None))
+        act = jax.jit(lambda obs: agent.act(None, agent.begin(None, fresh, params), obs, params, None))
         return np.asarray(act(obs)[1].kept.seen)
 
     whole = reads(agent)

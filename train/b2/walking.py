@@ -249,8 +249,8 @@ class WalkSession(Session):
         bare = dataclasses.replace(params, action_scale=jnp.zeros(3))
         found = {name: score(go(given), period) for name, given in (("policy", params), ("trot", bare))}
         self.folder.write_json(EVALUATION, {"schema": "subterra.evaluation/1", **self.world.facts, **found})
-        told = {f"{name}, {who}": value for who, figures in found.items() for name, value in figures.items()}
-        print_table(f"{self.world.task}, seed {self.learner.config.seed}: without exploration noise", told)
+        table = {f"{name}, {who}": value for who, figures in found.items() for name, value in figures.items()}
+        print_table(f"{self.world.task}, seed {self.learner.config.seed}: without exploration noise", table)
         return found
 
     def policy(self, snapshot: Snapshot) -> WalkPolicy:

@@ -7,6 +7,7 @@ from benchmarks.fidelity.derive.beams import mouths_on_path, returns, station_bi
 from benchmarks.fidelity.derive.clouds import real_planes
 from benchmarks.fidelity.derive.distances import (
     BOOTSTRAP_SAMPLES,
+    both_apart,
     cloud_distances,
     density_aware_chamfer,
     dilate,
@@ -17,7 +18,6 @@ from benchmarks.fidelity.derive.distances import (
     occupied_voxels,
     phantom_cells,
     shell_voxels,
-    told_together,
     tolerant_f1,
 )
 from benchmarks.fidelity.registry import Samples, Value, mean_magnitude, missing, number, percentile, rms
@@ -180,16 +180,16 @@ def vox_iou_20cm(case: Case) -> Value:
 
 @metric("vox_iou_norm", "OCC", U(0.934, 0.99511), gate=True, needs="hold")
 def vox_iou_norm(case: Case) -> Value:
-    """Intersection over union of voxels told together, over the value that two noisy draws of the candidate reach."""
+    """Intersection over union of voxels that tell clouds apart, over what two noisy draws of the candidate reach."""
     real, first, second = occupied_voxels(case).points
-    return number(iou(*told_together(real, first)) / max(iou(*told_together(first, second)), 1e-12), int(real.sum()))
+    return number(iou(*both_apart(real, first)) / max(iou(*both_apart(first, second)), 1e-12), int(real.sum()))
 
 
 @metric("vox_precision", "OCC", U(0.951, 0.99356), needs="hold", args=(1,))
 @metric("vox_recall", "OCC", U(0.967, 0.999867), needs="hold", args=(0,))
 def voxel_share(case: Case, side: int) -> Value:
     """Share of the voxels of one side (1 the candidate, 0 the held-out cloud) that the other has too."""
-    both = told_together(*occupied_voxels(case).points[:2])
+    both = both_apart(*occupied_voxels(case).points[:2])
     own = both[side].sum()
     return number(float((both[0] & both[1]).sum() / max(own, 1)), int(own))
 
@@ -242,7 +242,7 @@ def _mouth_slices(case: Case) -> np.ndarray:
 def projected_iou(case: Case, axis: int) -> Value:
     """Intersection over union seen along an axis: 0 the tunnel, 1 from the side, 2 from above."""
     real, first = (grid.sum(axis=axis) for grid in occupied_voxels(case).points[:2])
-    return number(iou(*told_together(real, first)), int(real.sum()))
+    return number(iou(*both_apart(real, first)), int(real.sum()))
 
 
 @metric("vox_chainage_min_f1", "OCC", U(0.5, 0.999999), needs="hold")

@@ -265,7 +265,7 @@ def dilate(grid: Bool[np.ndarray, "..."], by: int = 1) -> Bool[np.ndarray, "..."
     return ndimage.maximum_filter(grid.astype(np.uint8), 2 * by + 1, mode="constant").astype(bool)
 
 
-def told_cells(a: Int[np.ndarray, "..."], b: Int[np.ndarray, "..."]) -> Bool[np.ndarray, "..."]:
+def cells_apart(a: Int[np.ndarray, "..."], b: Int[np.ndarray, "..."]) -> Bool[np.ndarray, "..."]:
     """Return the cells that tell two clouds apart, from the number of points of each.
 
     Whether a surface that just cuts a cell has a point there is a matter of how many beams there are, and no point of
@@ -275,19 +275,19 @@ def told_cells(a: Int[np.ndarray, "..."], b: Int[np.ndarray, "..."]) -> Bool[np.
     return alone | (a + b >= _FEWEST_TOGETHER)
 
 
-def told_together(
+def both_apart(
     a: Int[np.ndarray, "..."], b: Int[np.ndarray, "..."]
 ) -> tuple[Bool[np.ndarray, "..."], Bool[np.ndarray, "..."]]:
     """Return where either cloud has a point, among the cells that tell them apart."""
-    told = told_cells(a, b)
-    return (a > 0) & told, (b > 0) & told
+    apart = cells_apart(a, b)
+    return (a > 0) & apart, (b > 0) & apart
 
 
 def shell_voxels(grids: Occupied) -> Bool[np.ndarray, "i j k"]:
     """Return the known voxels within `SHELL_VOXELS` of either surface that are free in both or tell them apart."""
     real, first = grids.points[:2]
-    told = (real + first == 0) | told_cells(real, first)
-    return grids.known & told & dilate(grids.real | grids.first, SHELL_VOXELS)
+    apart = (real + first == 0) | cells_apart(real, first)
+    return grids.known & apart & dilate(grids.real | grids.first, SHELL_VOXELS)
 
 
 def iou(a: Bool[np.ndarray, "..."], b: Bool[np.ndarray, "..."]) -> float:

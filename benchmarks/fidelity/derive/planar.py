@@ -75,8 +75,8 @@ def compile_observer(case: Case) -> Callable[[LidarPoses, jax.Array], np.ndarray
     env, params = make_environment(case)
 
     def look(xy: jax.Array, heading: jax.Array, station: jax.Array, normal: jax.Array) -> jax.Array:
-        begun = env.begin(env.draw_reset(jax.random.key(0), (), params), params)
-        state = begun.replace(position=xy, heading=heading, station=station)
+        fresh = env.begin(env.draw_reset(jax.random.key(0), (), params), params)
+        state = fresh.replace(position=xy, heading=heading, station=station)
         return env.observe(state, {"lidar": Noise(normal)}, params)[: params.lidar.n_beams]
 
     compiled = jax.jit(jax.vmap(look))

@@ -228,7 +228,7 @@ def metre(
     weights: Weights,
     profiles: Profiles,
     strip: MapStrip,
-    told: Float[Array, ""],
+    reported: Float[Array, ""],
     block: Array,
     passed: Float[Array, ""],
     error: Float[Array, ""],
@@ -239,7 +239,7 @@ def metre(
         weights: Trained weights, as `init` makes them.
         profiles: `N_SEEN` bins about the block.
         strip: The map of the tunnel.
-        told: Station reported as the start, m.
+        reported: Station reported as the start, m.
         block: Number of the block.
         passed: Correction at its end, by the localiser alone, m.
         error: Correction in it, m.
@@ -248,7 +248,7 @@ def metre(
     along = mean_along(jax.tree.map(lambda sums: sums[..., middle], profiles))
     moved = jnp.clip(passed, -FARTHEST, FARTHEST) / BIN
     lower = jnp.floor(moved)
-    first = told + BIN * (BLOCK * block + lower - _STRIDE * SIDE - SLACK)
+    first = reported + BIN * (BLOCK * block + lower - _STRIDE * SIDE - SLACK)
     mapped = map_features(weights, strip, first, N_REACH)
     return agreement(weights, seen_features(weights, profiles), mapped, along, moved - lower, error)
 
@@ -258,7 +258,7 @@ def sequence(
     whole: Profiles,
     before: int,
     strip: MapStrip,
-    told: Float[Array, ""],
+    reported: Float[Array, ""],
     sigma: Float[Array, ""],
     passed: Float[Array, "n"],
     log_rate: Float[Array, "n"],
@@ -270,14 +270,14 @@ def sequence(
         whole: Profiles of the drive.
         before: Bins of them before the start; at least `MARGIN`.
         strip: The map of the tunnel.
-        told: Station reported as the start, m.
+        reported: Station reported as the start, m.
         sigma: Its standard deviation, m.
         passed: Correction at the end of the block `DELAY` metres before each metre, by the localiser alone, m.
         log_rate: Log of the rate at which the localiser says that its error grows, at each metre.
     """
     n = passed.shape[0]
     seen = seen_features(weights, whole)
-    mapped = map_features(weights, strip, told - BIN * BEFORE, BLOCK * n + 2 * BEFORE)
+    mapped = map_features(weights, strip, reported - BIN * BEFORE, BLOCK * n + 2 * BEFORE)
 
     def one(block: Array, moved: Array, error: Array) -> Array:
         mine = jax.lax.dynamic_slice_in_dim(seen, before - MARGIN + BLOCK * block, BLOCK, axis=2)
@@ -296,8 +296,8 @@ def sequence(
         after = advance(weights, now, *row)
         return after, after
 
-    begun = start(weights, sigma)
-    _, after = jax.lax.scan(step, begun, (ratio, log_rate[DELAY:]))
+    prior = start(weights, sigma)
+    _, after = jax.lax.scan(step, prior, (ratio, log_rate[DELAY:]))
     return jax.tree.map(
-        lambda first, rest: jnp.concatenate([jnp.broadcast_to(first, (DELAY, *first.shape)), rest]), begun, after
+        lambda first, rest: jnp.concatenate([jnp.broadcast_to(first, (DELAY, *first.shape)), rest]), prior, after
     )

@@ -30,34 +30,34 @@ IN_MEMORY = [id for id, row in table.load().items() if row.category not in ("SCN
 
 
 @cache
-def corrupted(told: bool) -> Case:
-    beams = 1500 if told else 6000  # so many show sections and ground by themselves
+def corrupted(known: bool) -> Case:
+    beams = 1500 if known else 6000  # so many show sections and ground by themselves
     case = tube.case(RIGHT, replace(RIGHT, width=5.62, depth=0.11), beams=beams)
     fit = tube.hold(RIGHT, beams=300, seed=1)
     for fault in FAULTS:
         case = put_in(Site(case, np.random.default_rng(0)), fault)
-    return replace(case, fit=fit, truth=case.truth if told else None, cache={})
+    return replace(case, fit=fit, truth=case.truth if known else None, cache={})
 
 
-def values(told: bool) -> dict[str, tuple[float | None, float | None, int]]:
+def values(known: bool) -> dict[str, tuple[float | None, float | None, int]]:
     """Value, upper end of its interval and number of samples by metric; value and place of the worst windows."""
     found = {}
     for id in IN_MEMORY:
-        one = measure(id, corrupted(told))
+        one = measure(id, corrupted(known))
         found[id] = one.value, one.interval[1] if one.interval else None, one.n
-    for one in map(asdict, worst_windows(corrupted(told))):
+    for one in map(asdict, worst_windows(corrupted(known))):
         found[f"window {one['id']} {one['source']}"] = one["value"], one["start"], round(1e3 * one["judged"])
     return found
 
 
-def written(told: bool) -> dict[str, dict[str, str]]:
+def written(known: bool) -> dict[str, dict[str, str]]:
     with TABLE.open(newline="") as file:
-        return {row["id"]: row for row in csv.DictReader(file) if row["told"] == str(told)}
+        return {row["id"]: row for row in csv.DictReader(file) if row["known"] == str(known)}
 
 
-@pytest.mark.parametrize("told", [True, pytest.param(False, marks=pytest.mark.slow)])
-def test_every_value_is_what_it_was(told: bool) -> None:
-    rows, now = written(told), values(told)
+@pytest.mark.parametrize("known", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_every_value_is_what_it_was(known: bool) -> None:
+    rows, now = written(known), values(known)
     assert list(rows) == list(now)
     for id, (value, end, count) in now.items():
         for key, one in (("value", value), ("end", end)):
@@ -69,5 +69,5 @@ def test_every_value_is_what_it_was(told: bool) -> None:
 if __name__ == "__main__":
     with TABLE.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(("told", "id", "value", "end", "n"))
-        writer.writerows((told, id, *one) for told in (True, False) for id, one in values(told).items())
+        writer.writerow(("known", "id", "value", "end", "n"))
+        writer.writerows((known, id, *one) for known in (True, False) for id, one in values(known).items())

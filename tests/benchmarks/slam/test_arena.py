@@ -95,9 +95,9 @@ def test_evalio_is_given_a_recording_as_images_of_points(made):
         assert len(xyz) == facts.num_rows * facts.num_columns
         seen = np.abs(xyz[:, :3]).sum(axis=1) > 0.0
         valid = np.abs(points["x"]) + np.abs(points["y"]) + np.abs(points["z"]) > 0.0
-        told = np.column_stack([points["x"], points["y"], points["z"], points["ring"], 1e-9 * points["t"]])[valid]
+        outcome = np.column_stack([points["x"], points["y"], points["z"], points["ring"], 1e-9 * points["t"]])[valid]
         assert seen.sum() == valid.sum()
-        np.testing.assert_allclose(np.sort(xyz[seen], axis=0), np.sort(told, axis=0), atol=2e-6)
+        np.testing.assert_allclose(np.sort(xyz[seen], axis=0), np.sort(outcome, axis=0), atol=2e-6)
     np.testing.assert_allclose(one.mount.trans, record.IMU.shift)
 
 

@@ -152,9 +152,9 @@ def test_a_recording_must_be_whole_before_a_program_runs_on_it(drive, tmp_path, 
 
     def refused(sentence: str) -> None:
         assert command([*asked]) == 2
-        told = capsys.readouterr().err
-        assert sentence in told
-        assert told.count("\n") == 1
+        output = capsys.readouterr().err
+        assert sentence in output
+        assert output.count("\n") == 1
 
     whole = (one / "calibration.yaml").read_text()
     for text, sentence in (
@@ -187,8 +187,8 @@ def test_a_folder_without_anything_to_score_is_refused(tmp_path, capsys):
     write_tum(mine / "won.tum", *line())
     write_tum(mine / "one.tum", *line(541))
     assert command(["score", "--estimate", str(mine), *asked]) == 0
-    told = [row for row in capsys.readouterr().err.splitlines() if row.startswith("warning")]
-    assert ["14 s of poses" in told[0], "won.tum" in told[1], told[2].endswith("no poses of two")] == [True] * 3
+    output = [row for row in capsys.readouterr().err.splitlines() if row.startswith("warning")]
+    assert ["14 s of poses" in output[0], "won.tum" in output[1], output[2].endswith("no poses of two")] == [True] * 3
     write_tum(tmp_path / "others" / "three.tum", *line())
     for given, sentence in ((tmp_path / "others", "holds no NAME.tum"), (tmp_path / "nobody", "no such file")):
         assert command(["score", "--estimate", str(given), *asked]) == 2

@@ -145,9 +145,9 @@ def test_poses_of_a_camera_are_refused_and_a_bad_program_is_scored(tmp_path):
     truth = write_tum(tmp_path / "truth.tum", time, position, rotation)
     camera = Rotation.from_matrix([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     other = write_tum(tmp_path / "camera.tum", time, position, rotation * camera)
-    with pytest.raises(BenchmarkError, match=r"camera.tum: fits the truth only turned as a whole by 120°") as told:
+    with pytest.raises(BenchmarkError, match=r"camera.tum: fits the truth only turned as a whole by 120°") as output:
         score_files(other, truth)
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(output.value)
     assert score_files(other, truth, alignment="se3")[0].ape < 1e-6
     # One that stands still, and one that turns round half-way, are as bad as they are.
     still = write_tum(tmp_path / "still.tum", time, np.zeros_like(position), rotation)
@@ -205,10 +205,10 @@ def test_a_bad_estimate_is_one_sentence_and_status_2(tmp_path, capsys, content, 
     estimate.write_text(content)
     out = tmp_path / "out"
     assert command(["score", "--estimate", str(estimate), "--truth", str(truth), "--out", str(out)]) == 2
-    told = capsys.readouterr().err
-    assert told.startswith("error: ")
-    assert sentence in told
-    assert told.count("\n") == 1
+    output = capsys.readouterr().err
+    assert output.startswith("error: ")
+    assert sentence in output
+    assert output.count("\n") == 1
     assert not out.exists()
 
 

@@ -154,10 +154,10 @@ def test_several_tunnels_are_measured_together_and_compared_one_by_one(tmp_path,
     several = ("--task", "Subterra/StopAtShort-v1", "--tunnel", "open:cast:train:0-1", "--copies", "2")
     assert run_here(monkeypatch, *quick, *several, "--out", str(tmp_path)) == 0
     assert [record.id for record in read_records(tmp_path / "records.json")] == ["speed/4-tunnels-4"]
-    told = capsys.readouterr().out
-    assert "320 rays" in told
-    assert " 0 wrong" in told
-    assert ":train:" in told, "a part of the name was taken for a picture"
+    outcome = capsys.readouterr().out
+    assert "320 rays" in outcome
+    assert " 0 wrong" in outcome
+    assert ":train:" in outcome, "a part of the name was taken for a picture"
     true_scan = reference.lidar.scan
     monkeypatch.setattr(reference.lidar, "scan", lambda *args, **rest: true_scan(*args, **rest) + 0.01)
     assert run_here(monkeypatch, *quick, *several) == 1

@@ -43,10 +43,10 @@ def test_it_begins_anew_with_a_fresh_draw_and_keeps_the_last_observation(env):
     np.testing.assert_array_equal(done.T, [[(k + 1) % HORIZON == 0 for k in range(2 * HORIZON)]] * 3)
     np.testing.assert_array_equal(done, [out[5]["done"] for out in outs])
     assert not np.stack([out[3] for out in outs]).any()
-    begun, info = outs[HORIZON - 1][0], outs[HORIZON - 1][5]
-    np.testing.assert_array_equal(begun[:, 16], 0.0)
+    fresh, info = outs[HORIZON - 1][0], outs[HORIZON - 1][5]
+    np.testing.assert_array_equal(fresh[:, 16], 0.0)
     assert np.abs(info["final_observation"][:, 16] - 0.5).max() < 0.2
-    assert (obs[:, :16] != begun[:, :16]).any(axis=1).all()
+    assert (obs[:, :16] != fresh[:, :16]).any(axis=1).all()
     bias = np.stack([state.odometry.distance_bias, *(out[1].odometry.distance_bias for out in outs)])
     assert len(np.unique(bias)) == 9
     np.testing.assert_array_equal(outs[0][0], outs[0][5]["final_observation"])

@@ -148,30 +148,30 @@ def colours(picture):
 
 
 @pytest.fixture(scope="module")
-def begun():
+def fresh():
     env, params = st.make("Subterra/Obstructed-v1", "subterra-351")
     obs, state = jax.device_get(jax.jit(env.reset)(jax.random.key(1), params))
     return env, params, state, obs
 
 
-def at(begun, station):
+def at(fresh, station):
     """The picture with the robot elsewhere on the centreline."""
-    env, params, state, obs = begun
+    env, params, state, obs = fresh
     row = round(station / float(params.tunnel.spacing))
     moved = state.replace(position=np.asarray(params.tunnel.grid[row, :2]), station=np.float32(station))
     return colours(make_view("top").picture(env, params, moved, obs))
 
 
-def test_the_plan_shows_walls_beams_and_robot(begun):
-    assert at(begun, 0.0) >= {drawing.BACKGROUND, drawing.WALL, drawing.BEAM, drawing.ROBOT}
+def test_the_plan_shows_walls_beams_and_robot(fresh):
+    assert at(fresh, 0.0) >= {drawing.BACKGROUND, drawing.WALL, drawing.BEAM, drawing.ROBOT}
 
 
-def test_the_goal_and_the_boxes_are_shown_where_they_are_near(begun):
-    goal = float(begun[2].goal.station)
-    assert drawing.GOAL in at(begun, goal - 5.0)
-    assert drawing.GOAL not in at(begun, goal - 20.0 if goal > 30.0 else goal + 20.0)
-    start = float(begun[2].station)  # boxes stand ahead of it
-    assert any(drawing.BOX in at(begun, start + ahead) for ahead in (15.0, 30.0, 45.0))
+def test_the_goal_and_the_boxes_are_shown_where_they_are_near(fresh):
+    goal = float(fresh[2].goal.station)
+    assert drawing.GOAL in at(fresh, goal - 5.0)
+    assert drawing.GOAL not in at(fresh, goal - 20.0 if goal > 30.0 else goal + 20.0)
+    start = float(fresh[2].station)  # boxes stand ahead of it
+    assert any(drawing.BOX in at(fresh, start + ahead) for ahead in (15.0, 30.0, 45.0))
 
 
 def test_a_box_and_a_goal_are_drawn_where_they_are():

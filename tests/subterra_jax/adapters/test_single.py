@@ -112,12 +112,12 @@ def test_the_numbers_are_those_of_the_environment_beneath(env):
         action = np.array([1.5, 0.3 * np.sin(k)], np.float32)
         key, stream = take_key(stream)
         expected, state, reward, terminated, truncated, info = step(key, state, action, params)
-        obs, got, *flags, told = env.step(action)
+        obs, got, *flags, outcome = env.step(action)
         np.testing.assert_allclose(obs, expected, atol=1e-3)
         assert got == pytest.approx(float(reward), abs=1e-5)
         assert flags == [bool(terminated), bool(truncated)]
-        assert set(told) == set(info)
-        assert told["station"] == pytest.approx(float(info["station"]), abs=1e-4)
+        assert set(outcome) == set(info)
+        assert outcome["station"] == pytest.approx(float(info["station"]), abs=1e-4)
 
 
 def test_observations_are_not_overwritten_by_later_steps(env):

@@ -39,7 +39,7 @@ class Walking:
         action = jnp.zeros((N_ROBOTS, 12)) if action is None else action
         return self.compiled["step"](jax.random.key(seed), state, action, self.params if params is None else params)
 
-    def told(self, command, **further: Any):
+    def commanded(self, command, **further: Any):
         """Params under which one command holds for ever, without pushes and without noise or randomisation."""
         command = jnp.asarray(command, jnp.float32)
         fields = {"low": command, "high": command, "still": jnp.float32(0.0), "corridor": jnp.float32(10.0)}

@@ -148,7 +148,7 @@ def in_c():
 @pytest.fixture(scope="module")
 def moment(walking):
     """Eight robots on their way, where their anchors lie, and where their servos are to go."""
-    params = walking.told((0.5, 0.0, 0.0))
+    params = walking.commanded((0.5, 0.0, 0.0))
     aims = jax.jit(jax.vmap(lambda s: command_joints(s, jnp.zeros(12), PERIOD, params)[1]))
 
     def seen(state):
@@ -190,18 +190,18 @@ def test_half_a_second_in_both_engines_ends_in_nearly_the_same_pose(walking, mom
 @pytest.mark.slow
 def test_in_ten_seconds_robots_of_both_engines_get_equally_far(walking, moment):
     """Legs are chaotic: from one state, two engines part by metres in 10 s. What stays is how far eight robots get."""
-    params, begun, _ = moment
+    params, fresh, _ = moment
     low, high = (jnp.array([0.5, 0.0, side], jnp.float32) for side in (-0.8, 0.8))
     steered = dataclasses.replace(walking.params.command, low=low, high=high, still=jnp.float32(0.0))
     params = dataclasses.replace(params, command=steered)
     env, _ = make(engine="mujoco")
     in_c, act, far = jax.jit(st.AutoReset(env).step), jax.jit(load_policy()[0].act), []
     for step in (walking.compiled["step"], in_c):
-        state, action, ended = begun, jnp.zeros((N_ROBOTS, 12)), False
+        state, action, ended = fresh, jnp.zeros((N_ROBOTS, 12)), False
         for k in range(500):
             obs, state, _, terminated, *_ = step(jax.random.key(k), state, action, params)
             action, ended = act(obs), ended | bool(np.any(terminated))
-        far.append(np.abs(np.asarray(params.track.station[state.anchor] - params.track.station[begun.anchor])))
+        far.append(np.abs(np.asarray(params.track.station[state.anchor] - params.track.station[fresh.anchor])))
         assert not ended
     assert np.mean(far[0]) == pytest.approx(np.mean(far[1]), rel=0.05)
     assert np.mean(far[0]) > 3.0

@@ -76,23 +76,23 @@ def test_a_chosen_start_is_refused_in_one_sentence(env):
 
 
 def test_told_to_walk_it_walks_and_its_legs_know_how_far(env):
-    told = drive(env, (0.6, 0.0), 20)
-    start, info, obs = told[4][4]["station"], told[-1][4], told[-1][0]
-    assert not any(step[2] for step in told)
+    outcome = drive(env, (0.6, 0.0), 20)
+    start, info, obs = outcome[4][4]["station"], outcome[-1][4], outcome[-1][0]
+    assert not any(step[2] for step in outcome)
     assert 1.0 < info["station"] - start < 2.5  # in 3 s
     walked = info["station"] - 2.0
     assert obs[16] == pytest.approx(walked, rel=0.15)
     assert isinstance(info["station"], float)
     assert isinstance(info["fall"], bool)
     paid = sum(value for name, value in info.items() if name.startswith("reward_"))
-    assert told[-1][1] == pytest.approx(paid, rel=1e-4)
+    assert outcome[-1][1] == pytest.approx(paid, rel=1e-4)
 
 
 def test_told_to_stand_it_stands_and_a_nan_is_a_zero(env):
-    told = drive(env, (0.0, 0.0), 15)
-    assert abs(told[-1][4]["station"] - told[9][4]["station"]) < 0.02  # once the feet are settled
+    outcome = drive(env, (0.0, 0.0), 15)
+    assert abs(outcome[-1][4]["station"] - outcome[9][4]["station"]) < 0.02  # once the feet are settled
     again = drive(env, (np.nan, np.nan), 15)
-    np.testing.assert_array_equal(told[-1][0], again[-1][0])
+    np.testing.assert_array_equal(outcome[-1][0], again[-1][0])
 
 
 def test_the_same_seed_gives_the_same_walk_and_another_one_another(env):
@@ -137,15 +137,15 @@ def test_success_is_the_share_of_the_tunnel_that_the_rule_asks_for(env):
     programs = task.programs
     task.programs = programs._replace(step=partial(programs.step.func, near))
     try:
-        told = []
+        outcome = []
         env.reset(seed=2)
-        while not (told and (told[-1][2] or told[-1][3])) and len(told) < 20:
-            told.append(env.step(np.array([0.8, 0.0], np.float32)))
+        while not (outcome and (outcome[-1][2] or outcome[-1][3])) and len(outcome) < 20:
+            outcome.append(env.step(np.array([0.8, 0.0], np.float32)))
     finally:
         task.programs = programs
-    assert told[-1][2]
-    assert told[-1][4]["success"]
-    assert told[-1][4]["coverage"] >= 0.052
+    assert outcome[-1][2]
+    assert outcome[-1][4]["success"]
+    assert outcome[-1][4]["coverage"] >= 0.052
 
 
 @pytest.fixture(scope="module")
@@ -166,11 +166,11 @@ def test_gymnasium_knows_the_walking_task_by_its_id(plan):
 def test_the_zero_action_walks_as_it_is_told_in_mujoco_too(walk):
     assert walk.action_space.shape == (12,)
     assert walk.metadata["render_fps"] == 50
-    told = drive(walk, np.zeros(12), 150, seed=3)
+    outcome = drive(walk, np.zeros(12), 150, seed=3)
     again = drive(walk, np.full(12, np.nan), 5, seed=3)
-    np.testing.assert_array_equal(told[4][0], again[4][0])
-    assert not any(step[2] for step in told)
-    ahead = [step[4]["velocity"][0] for step in told[75:]]  # m/s, once it is under way
+    np.testing.assert_array_equal(outcome[4][0], again[4][0])
+    assert not any(step[2] for step in outcome)
+    ahead = [step[4]["velocity"][0] for step in outcome[75:]]  # m/s, once it is under way
     assert 0.2 < np.mean(ahead) < 0.8
 
 

@@ -1,4 +1,4 @@
-"""The gait that is released, the B2 in missions that walk as it does, and what its agents are told."""
+"""The gait that is released, the B2 in missions that walk as it does, and what its agents are given."""
 
 import dataclasses
 from types import SimpleNamespace
@@ -83,15 +83,15 @@ def run():
 
 
 def test_a_step_of_the_command_is_followed_exponentially(run):
-    actions, told = run
+    actions, outcome = run
     expected = LATE.gain[0] * actions[0, 0] * (1.0 - np.exp(-0.2 * np.arange(1, 7) / LATE.lag[0]))
-    np.testing.assert_allclose(told[:6, 0], expected, rtol=1e-4)
+    np.testing.assert_allclose(outcome[:6, 0], expected, rtol=1e-4)
 
 
 def test_the_robot_moves_as_fast_as_its_lagged_command_says(run):
-    _, told = run
-    moved = np.hypot(*np.diff(told[:, 2:4], axis=0).T)
-    np.testing.assert_allclose(moved, 0.2 * told[1:, 0], rtol=1e-2)
+    _, outcome = run
+    moved = np.hypot(*np.diff(outcome[:, 2:4], axis=0).T)
+    np.testing.assert_allclose(moved, 0.2 * outcome[1:, 0], rtol=1e-2)
 
 
 def test_beams_that_point_down_end_on_the_ballast_and_no_others_change():
@@ -123,7 +123,7 @@ def test_figures_of_four_robots_are_what_one_counts_by_hand():
         success=np.array([True, True, False, False]),
         contact=np.array([False, False, False, True]),
         fall=np.array([False, False, True, False]),
-        begun=np.full(4, 2.0),
+        start=np.full(4, 2.0),
     )
     rows = transfer.Row(
         lateral=np.array([[0.3, -0.4, np.nan, np.nan]]),
@@ -132,16 +132,16 @@ def test_figures_of_four_robots_are_what_one_counts_by_hand():
         lean=np.array([[[0.1, 0.0], [-0.1, 0.0], [np.nan] * 2, [np.nan] * 2]]),
         sway=np.array([[[0.3], [-0.4], [np.nan], [np.nan]]]),
     )
-    told = transfer.figures(walk, rows, PARAMS)
-    assert told["robots"] == 4
-    assert (told["success_percent"], told["fall_percent"], told["contact_percent"]) == (50.0, 25.0, 25.0)
-    assert told["coverage_median_percent"] == pytest.approx(60.0)
-    assert told["speed_mean"] == pytest.approx((0.8 + 0.8 + 0.4 + 0.0) / 4)
-    assert told["lateral_rms"] == told["range_off_rms"] == pytest.approx(np.sqrt(0.125))
-    assert told["odometer_error_percent"] == pytest.approx(0.0)
-    assert told["odometer_error_sigma_percent"] == pytest.approx(100.0 * np.sqrt(2 * 0.05**2 / 4))
-    assert (told["speed_obeyed_percent"], told["yaw_obeyed_percent"]) == pytest.approx((70.0, 50.0))
-    assert told["pitch_sigma_deg"] == pytest.approx(np.rad2deg(0.1))
+    outcome = transfer.figures(walk, rows, PARAMS)
+    assert outcome["robots"] == 4
+    assert (outcome["success_percent"], outcome["fall_percent"], outcome["contact_percent"]) == (50.0, 25.0, 25.0)
+    assert outcome["coverage_median_percent"] == pytest.approx(60.0)
+    assert outcome["speed_mean"] == pytest.approx((0.8 + 0.8 + 0.4 + 0.0) / 4)
+    assert outcome["lateral_rms"] == outcome["range_off_rms"] == pytest.approx(np.sqrt(0.125))
+    assert outcome["odometer_error_percent"] == pytest.approx(0.0)
+    assert outcome["odometer_error_sigma_percent"] == pytest.approx(100.0 * np.sqrt(2 * 0.05**2 / 4))
+    assert (outcome["speed_obeyed_percent"], outcome["yaw_obeyed_percent"]) == pytest.approx((70.0, 50.0))
+    assert outcome["pitch_sigma_deg"] == pytest.approx(np.rad2deg(0.1))
 
 
 @pytest.mark.parametrize("name", ["nothing", "truth"])

@@ -20,17 +20,17 @@ from tests.subterra_jax.tunnels import straight, tunnel_arrays
 def run(walking, seconds, params, seed=0):
     """Zero actions for a while; last state, and what every step reported."""
     _, state = walking.reset(seed, params)
-    told = []
+    outcome = []
     for k in range(round(seconds / 0.02)):
         _, state, _, terminated, _, info = walking.step(1000 * seed + k, state, params=params)
-        told.append({"terminated": terminated, **info})
-    return state, {name: np.stack([step[name] for step in told]) for name in told[0]}
+        outcome.append({"terminated": terminated, **info})
+    return state, {name: np.stack([step[name] for step in outcome]) for name in outcome[0]}
 
 
 def test_under_no_command_the_zero_action_stands_on_sleepers(walking):
-    _, told = run(walking, 2.0, walking.told((0.0, 0.0, 0.0)))
-    assert not told["terminated"].any()
-    settled = told["station"][60:]  # once the feet have found the ballast
+    _, outcome = run(walking, 2.0, walking.commanded((0.0, 0.0, 0.0)))
+    assert not outcome["terminated"].any()
+    settled = outcome["station"][60:]  # once the feet have found the ballast
     assert np.abs(settled - settled[0]).max() < 0.05
 
 
@@ -39,9 +39,9 @@ def test_the_zero_action_walks_over_sleepers_at_three_quarters_of_what_is_asked(
 
     One in six stumbles and has half of it, on either track; the policy makes up for what is missing, see `test_policy`.
     """
-    state, told = run(walking, 4.0, walking.told((0.6, 0.0, 0.0)))
-    assert not told["terminated"].any()
-    speed = (told["station"][-1] - told["station"][99]) * np.asarray(state.facing) / 2.0
+    state, outcome = run(walking, 4.0, walking.commanded((0.6, 0.0, 0.0)))
+    assert not outcome["terminated"].any()
+    speed = (outcome["station"][-1] - outcome["station"][99]) * np.asarray(state.facing) / 2.0
     assert speed.mean() == pytest.approx(0.45, abs=0.05)
     assert np.median(speed) == pytest.approx(0.45, abs=0.04)
     assert (np.abs(speed - 0.4) < 0.25).all()
@@ -186,7 +186,7 @@ def test_a_wall_is_told_as_contact(walking):
 
 
 def test_a_wall_stops_a_robot_that_is_told_to_walk_through_it(walking):
-    params = walking.told((0.0, 0.3, 0.0))
+    params = walking.commanded((0.0, 0.3, 0.0))
     _, state = walking.reset(12, params)
     state, reached, touched = moved_aside(walking.params.track, state, 2.3 * state.facing), [], False
     for k in range(150):

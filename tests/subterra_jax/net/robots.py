@@ -27,7 +27,7 @@ def made(id):
     return env, params, begin, advance, observe
 
 
-def begun(id, n, key=0):
+def fresh(id, n, key=0):
     """States of n robots at the start of their episodes."""
     return made(id)[2](jax.random.key(key), n)
 

@@ -17,8 +17,8 @@ from tests.subterra_jax.net.robots import (
     advanced,
     assert_covariance,
     assert_mean,
-    begun,
     driven,
+    fresh,
     made,
     observed,
     placed,
@@ -41,8 +41,8 @@ LENGTH, MARGIN = 351.05, 40.0  # m: of the tunnel, and between a mouth and start
     ],
 )
 def test_goals_lie_anywhere_in_their_range_from_the_start_and_starts_anywhere_in_the_room_left(id, low, high):
-    state = begun(id, MANY)
-    start, goal = (np.asarray(values, np.float64) for values in (state.goal.told, state.goal.station))
+    state = fresh(id, MANY)
+    start, goal = (np.asarray(values, np.float64) for values in (state.goal.reported, state.goal.station))
     way = goal - start
     assert low - 1e-3 <= way.min() < low + 0.01 * (high - low)
     assert high - 0.01 * (high - low) < way.max() <= high + 0.1
@@ -60,8 +60,8 @@ def test_goals_lie_anywhere_in_their_range_from_the_start_and_starts_anywhere_in
 
 @pytest.mark.parametrize("id", ["Subterra/StopAt-v1", "Subterra/Return-v1"])
 def test_robots_start_where_the_task_says(id):
-    state = begun(id, MANY)
-    np.testing.assert_allclose(state.station, state.goal.told, atol=1e-4)
+    state = fresh(id, MANY)
+    np.testing.assert_allclose(state.station, state.goal.reported, atol=1e-4)
     lateral = np.asarray(state.lateral, np.float64)
     # Uniform to either side: 0.5 m and 0.1 rad.
     off_axis = np.arcsin(np.asarray(jax.vmap(made(id)[0].privileged, (0, None))(state, made(id)[1])["heading_sin"]))
@@ -79,7 +79,7 @@ def errors_about(tolerance, n):
 @pytest.mark.parametrize("id", WITH_GOAL)
 def test_a_stop_counts_within_1_metre_and_within_25_centimetres_in_the_short_tasks(id):
     tolerance = 0.25 if "Short" in id else 1.0
-    state, report = begun(id, FEW), None
+    state, report = fresh(id, FEW), None
     error, inside = errors_about(tolerance, FEW)
     if "Relocalise" in id:
         state = placed(id, state, state.station)
@@ -87,7 +87,7 @@ def test_a_stop_counts_within_1_metre_and_within_25_centimetres_in_the_short_tas
     else:
         target = state.goal.station
         if "Return" in id:
-            state, target = advanced(id, placed(id, state, target), np.zeros(2))[0], state.goal.told
+            state, target = advanced(id, placed(id, state, target), np.zeros(2))[0], state.goal.reported
         state = placed(id, state, target + error)
     _, _, early, before = stand(id, state, 9 if "Return" not in id else 8, report)
     assert not before["stopped"].any()
@@ -102,7 +102,7 @@ def test_a_stop_counts_within_1_metre_and_within_25_centimetres_in_the_short_tas
 
 def test_a_report_of_the_wrong_direction_is_no_success():
     id = "Subterra/Relocalise-v1"
-    state = begun(id, FEW)
+    state = fresh(id, FEW)
     state = placed(id, state, state.station, backward=True)
     _, _, ended, info = stand(id, state, 10, np.asarray(state.station))
     assert ended.all()
@@ -111,7 +111,7 @@ def test_a_report_of_the_wrong_direction_is_no_success():
 
 def test_the_flag_is_raised_within_2_metres_of_the_goal():
     id = "Subterra/Return-v1"
-    state = begun(id, FEW)
+    state = fresh(id, FEW)
     error, inside = errors_about(2.0, FEW)
     _, _, _, info = stand(id, placed(id, state, state.goal.station + error), 1)
     np.testing.assert_array_equal(info["flag"], inside)
@@ -127,7 +127,7 @@ def test_the_flag_is_raised_within_2_metres_of_the_goal():
 )
 def test_below_5_centimetres_and_half_a_radian_a_second_is_standing(command, stands):
     id = "Subterra/StopAt-v1"
-    state = placed(id, begun(id, FEW), 100.0)
+    state = placed(id, fresh(id, FEW), 100.0)
     for k in range(10):
         state, _, _, _, info = advanced(id, state, command, key=k)
     # The speed that counts is the true one: it slips by 3 %.
@@ -136,7 +136,7 @@ def test_below_5_centimetres_and_half_a_radian_a_second_is_standing(command, sta
 
 def test_a_robot_that_has_not_reported_within_60_metres_has_failed():
     id, limit = "Subterra/Relocalise-v1", 60.0
-    state, travelled, ended = begun(id, FEW), np.zeros(FEW), np.zeros(FEW, bool)
+    state, travelled, ended = fresh(id, FEW), np.zeros(FEW), np.zeros(FEW, bool)
     # Back and forth over 20 m: the limit is of the distance, wherever it is driven.
     for k in range(round(limit / 20.0) + 1):
         state, series = driven(id, placed(id, state, 20.0), 100, key=k)
@@ -155,7 +155,7 @@ def test_nine_tenths_covered_in_contact_with_a_wall_are_no_success():
     _, params, *_ = made(id)
     threshold, n = 0.9 * float(params.tunnel.length), FEW
     lateral = np.where(np.arange(n) < n // 2, 0.0, 2.6)  # the walls are 2.8 m away, the robot's radius is 0.4 m
-    state = placed(id, begun(id, n), threshold - 0.1, lateral).replace(furthest=jnp.full(n, threshold - 0.1))
+    state = placed(id, fresh(id, n), threshold - 0.1, lateral).replace(furthest=jnp.full(n, threshold - 0.1))
     _, _, terminated, truncated, info = advanced(id, state, np.array([2.0, 0.0]))
     info = {name: np.asarray(value) for name, value in info.items()}
     np.testing.assert_array_equal(info["contact"], lateral > 0.0)
@@ -189,7 +189,7 @@ def test_neither_evaluation_nor_trace_counts_coverage_in_contact_as_success(bloc
 
 def among_boxes(id, n):
     """Robots at their starts, and boxes as if all had begun at the mouth."""
-    state = begun(id, n)
+    state = fresh(id, n)
     if "Obstructed" not in id:
         return state
     return state.replace(obstacles=state.obstacles.replace(start=jnp.zeros(n)))
@@ -273,7 +273,7 @@ def test_the_recorder_gives_an_agent_what_it_declares_and_no_more(name, tmp_path
 def test_the_truth_that_is_handed_out_is_the_truth():
     id = "Subterra/StopAt-v1"
     env, params, *_ = made(id)
-    state, _ = driven(id, begun(id, 50), 50)
+    state, _ = driven(id, fresh(id, 50), 50)
     known = jax.vmap(env.privileged, (0, None))(state, params)
     np.testing.assert_array_equal(known["station"], state.station)
     np.testing.assert_allclose(known["to_goal"], state.goal.station - state.station, atol=1e-4)

@@ -14,8 +14,8 @@ from tests.subterra_jax.net.robots import (
     advanced,
     assert_covariance,
     assert_mean,
-    begun,
     driven,
+    fresh,
     made,
     observed,
     placed,
@@ -26,7 +26,7 @@ from tests.subterra_jax.net.robots import (
 def reward_cases(id):
     """States before and after single steps: on the way, at a stop and at a contact, with commands and infos."""
     n = FEW
-    start = placed(id, begun(id, n), np.random.default_rng(0).uniform(20.0, 55.0, n))
+    start = placed(id, fresh(id, n), np.random.default_rng(0).uniform(20.0, 55.0, n))
     rng = np.random.default_rng(1)
     first = np.stack([rng.uniform(0.0, 2.0, n), rng.uniform(-1.0, 1.0, n)], -1)
     second = np.stack([rng.uniform(0.0, 2.0, n), rng.uniform(-1.0, 1.0, n)], -1)
@@ -70,7 +70,7 @@ def test_the_terms_of_the_reward_of_a_goal_are_those_that_are_written_down(id):
 def test_a_stop_pays_less_the_further_it_is_from_the_goal_and_a_far_one_costs():
     id = "Subterra/StopAt-v1"
     error = np.linspace(0.0, 40.0, FEW)
-    state = begun(id, FEW)
+    state = fresh(id, FEW)
     state = placed(id, state.replace(goal=state.goal.replace(station=jnp.full(FEW, 100.0))), 100.0 + error)
     _, gain, _, _ = stand(id, state, 10)
     assert (np.diff(gain) < 0.0).all()
@@ -103,7 +103,7 @@ def reward_cases_of_t0(id):
     n, length = FEW, float(made(id)[1].tunnel.length)
     command = np.tile([1.5, 0.2], (n, 1))
     for station in (100.0, 0.9 * length):
-        state = placed(id, begun(id, n), np.random.default_rng(0).uniform(station - 0.3, station + 0.3, n))
+        state = placed(id, fresh(id, n), np.random.default_rng(0).uniform(station - 0.3, station + 0.3, n))
         state = state.replace(furthest=jnp.full(n, station - 0.1))
         state, *_ = advanced(id, state, command)
         yield state, command, np.tile([0.7, -0.3], (n, 1))
@@ -141,7 +141,7 @@ def stretches(series):
 
 
 def test_in_t0_the_plant_is_exact_and_the_odometer_has_a_scale_of_2_percent_and_noise_of_1_cm():
-    _, series = driven("Subterra/Traverse-v1", begun("Subterra/Traverse-v1", MANY), 100)
+    _, series = driven("Subterra/Traverse-v1", fresh("Subterra/Traverse-v1", MANY), 100)
     np.testing.assert_allclose(series["moved"], 0.2, rtol=2e-3)
     np.testing.assert_allclose(series["turned"], series["asked"], atol=2e-5)
     first, second = stretches(series["counted"]) - 10.0
@@ -153,7 +153,7 @@ def test_in_t0_the_plant_is_exact_and_the_odometer_has_a_scale_of_2_percent_and_
 
 @pytest.mark.parametrize("id", ["Subterra/Traverse-v1", "Subterra/Return-v1"])
 def test_the_odometers_yaw_rate_is_off_by_2_mrad_a_second(id):
-    start = begun(id, MANY)
+    start = fresh(id, MANY)
     middle, _ = driven(id, start, 50)
     end, _ = driven(id, middle, 50, key=2)
     errors = []
@@ -169,7 +169,7 @@ def test_the_odometers_yaw_rate_is_off_by_2_mrad_a_second(id):
 @functools.cache
 def drive_of_100_metres(id, backward):
     """Relative errors of the plant and of the odometer in ten stretches of 10 m, and of the yaw rate, rad/s."""
-    state = begun(id, MANY)
+    state = fresh(id, MANY)
     state = placed(id, state, 200.0 if backward else 20.0, backward=backward)
     _, series = driven(id, state, 500)
     true, counted = stretches(series["moved"]), stretches(series["counted"])
@@ -200,7 +200,7 @@ def test_facing_falling_stations_adds_another_2_percent_to_the_odometers_scale()
 
 def test_the_error_of_the_way_back_is_not_that_of_the_way_out():
     id = "Subterra/Return-v1"
-    state, out = driven(id, placed(id, begun(id, MANY), 100.0), 150)
+    state, out = driven(id, placed(id, fresh(id, MANY), 100.0), 150)
     _, back = driven(id, placed(id, state, 130.0, backward=True), 150, key=2)
     out, back = ((stretches(s["counted"]) / stretches(s["moved"]) - 1.0) for s in (out, back))
     # Between the first stretch out and the last back lie 50 m.
@@ -210,7 +210,7 @@ def test_the_error_of_the_way_back_is_not_that_of_the_way_out():
 
 def test_ranges_have_5_cm_of_noise_and_end_at_30_metres():
     id = "Subterra/StopAt-v1"
-    state = placed(id, begun(id, FEW), np.linspace(20.0, 330.0, FEW))
+    state = placed(id, fresh(id, FEW), np.linspace(20.0, 330.0, FEW))
     one, two = (observed(id, state, key)["ranges"] for key in (1, 2))
     wall = (one < 29.0) & (two < 29.0)
     assert wall.mean() > 0.8

@@ -65,8 +65,8 @@ def drives(plans):
         speed[:3] = velocity
         ride, rows = Ride(Body(pose, speed, rest, np.zeros(2, np.float32)), anchor), []
         for k in range(round(seconds / PERIOD)):
-            told = control(k * PERIOD) if callable(control) else control
-            ride = advance(name, laid, ride, np.array(told, np.float32))
+            outcome = control(k * PERIOD) if callable(control) else control
+            ride = advance(name, laid, ride, np.array(outcome, np.float32))
             rows.append((np.asarray(both.position)[ride.anchor] + ride.body.qpos[:3], ride.body.qvel[:3]))
         where, velocity = (np.array(part) for part in zip(*rows, strict=True))
         return where - [0.0, 0.0, rover.HEIGHT], velocity
@@ -145,12 +145,12 @@ def task(plans):
         other, obs = params.replace(**changes), []
         first, state = reset(jax.random.key(1), other)
         obs.append(first)
-        told = []
+        outcome = []
         for k, command in enumerate(commands):
             seen, state, *rest = step(jax.random.key(k), state, jnp.array(command, jnp.float32), other)
             obs.append(seen)
-            told.append((state, *rest))
-        return np.array(obs), told
+            outcome.append((state, *rest))
+        return np.array(obs), outcome
 
     return env, params, go
 
@@ -161,36 +161,36 @@ def test_its_task_is_that_of_the_kinematic_robot(task, plans):
     assert env.fields(params) == wheels.fields(planar)
     assert env.rule == wheels.rule
     open_agent(ID.split("/")[1], env, params.replace(start=StartParams(lateral=0.1)))  # one for wheels may drive it
-    obs, told = go([(1.0, 0.1)] * 40)
+    obs, outcome = go([(1.0, 0.1)] * 40)
     _, state = jax.jit(wheels.reset)(jax.random.key(1), planar)
-    np.testing.assert_allclose(state.position, told[0][0].position, atol=0.02)
+    np.testing.assert_allclose(state.position, outcome[0][0].position, atol=0.02)
     far = []
     for k in range(40):
         _, state, *_ = jax.jit(wheels.step)(jax.random.key(k), state, jnp.array([1.0, 0.1]), planar)
         far.append(float(state.station))
-    mine = [float(step[0].station) for step in told]
+    mine = [float(step[0].station) for step in outcome]
     assert mine[-1] - mine[9] == pytest.approx(far[-1] - far[9], rel=0.02)
     odometer = obs[:, env.fields(params)["distance"]] if "distance" in env.fields(params) else obs[:, 16:17]
     assert float(odometer[-1, 0]) == pytest.approx(mine[-1] - 1.0, abs=0.4)
-    assert not any(bool(step[2]) for step in told)
+    assert not any(bool(step[2]) for step in outcome)
 
 
 def test_in_a_stack_it_stands_on_the_ground_of_its_own_tunnel(plans):
     env, params = st.make("Subterra/Traverse-v1", tunnel=[plans[1], *plans], motion="rover")
     driver, agent = Driver(env), open_agent("dead-reckoning", env, params)
-    begun = driver.begin(params, agent, np.arange(3, dtype=np.uint32), np.arange(3))
-    rides = begun.state.parts["rover"]
+    fresh = driver.begin(params, agent, np.arange(3, dtype=np.uint32), np.arange(3))
+    rides = fresh.state.parts["rover"]
     place = params.track.position[rides.anchor] + rides.body.qpos[:, :3]
     np.testing.assert_array_equal(params.track.tunnel[rides.anchor], [0, 1, 2])
-    np.testing.assert_allclose(place[:, :2], begun.state.position, atol=0.02)
+    np.testing.assert_allclose(place[:, :2], fresh.state.position, atol=0.02)
 
 
 def test_a_wall_ends_its_episode_by_contact(task):
     _, _, go = task
-    _, told = go([(1.0, 0.5)] * 60)
-    ends = [bool(step[2]) for step in told]
+    _, outcome = go([(1.0, 0.5)] * 60)
+    ends = [bool(step[2]) for step in outcome]
     assert True in ends
-    info = told[ends.index(True)][4]
+    info = outcome[ends.index(True)][4]
     assert bool(info["contact"])
     assert not bool(info["success"])
     assert not bool(info["fall"])

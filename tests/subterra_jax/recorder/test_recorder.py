@@ -61,8 +61,8 @@ def test_rosbags_reads_what_the_agent_saw_and_did(config, trace, messages):
     seen, (_, first) = trace.observation[:, :16], messages["/scan"][0]
     np.testing.assert_array_equal(ranges, np.where(seen >= np.float32(first.range_max), np.inf, seen))
     assert 0.0 < first.range_min <= np.min(ranges)
-    told = np.array([(m.twist.linear.x, m.twist.angular.z) for _, m in messages["/cmd_vel"]])
-    np.testing.assert_allclose(told, trace.command, rtol=1e-6)
+    commanded = np.array([(m.twist.linear.x, m.twist.angular.z) for _, m in messages["/cmd_vel"]])
+    np.testing.assert_allclose(commanded, trace.command, rtol=1e-6)
     np.testing.assert_allclose([time for time, _ in messages["/scan"]], trace.time, atol=1e-6)
     one = messages["/scan"][5][1]
     assert one.angle_min + 15 * one.angle_increment == pytest.approx(one.angle_max)
