@@ -60,7 +60,7 @@ class Command:
     # Length of the tunnel to use, m; 0 is all of it. A policy trained on all of it has never been near a far mouth; for
     # a short trial, lower `coverage` instead.
     length: float = 0.0
-    coverage: float | None = None  # Share of the tunnel that counts as success; the task's own if not given.
+    coverage: float | None = None  # Fraction of the tunnel that counts as success; the task's own if not given.
     out: Path | None = None  # File for the figures, as records.
 
 

@@ -106,7 +106,7 @@ def load_truth(path: Path) -> Truth:
 
 NEAR = 0.10  # m within which a wall point counts as met
 _STEP = 0.5  # m between the stations at which sizes are read
-_LEVELS = np.arange(-0.42, 0.43, 0.06)  # heights of chords about the middle, as shares of the height
+_LEVELS = np.arange(-0.42, 0.43, 0.06)  # heights of chords about the middle, as fractions of the height
 _SMOOTH = 3  # stations of the running median of an error, so that one chord into a crack decides nothing
 _FLOOR_LINES = (-0.3, 0.0, 0.3)  # m beside the axis at which the floor is read; the lowest, between sleepers, counts
 
@@ -197,7 +197,7 @@ def _summed(name: str, error: np.ndarray, station: np.ndarray) -> dict[str, floa
 
 
 def end_figures(scene: Path, origin: np.ndarray, truth: Truth) -> dict[str, float]:
-    """Return the true stations at which the built bore begins and ends, and the share of the span that it covers."""
+    """Return the true stations at which the built bore begins and ends, and the fraction of the span that it covers."""
     with np.load(scene / "bore.npz") as bore:
         first, last = (project_station(point + origin, truth) for point in bore["position"][[0, -1]])
     station = np.sort([first, last])
@@ -361,7 +361,7 @@ def as_markdown(rows: list[dict[str, Any]]) -> str:
 
 
 def _number(row: dict[str, Any], name: str, digits: int = 1) -> str:
-    """Returns a length in cm, or a share in %."""
+    """Returns a length in cm, or a fraction in %."""
     value = row.get(name)
     return "" if value is None or math.isnan(value) else f"{100.0 * value:.{digits}f}"
 

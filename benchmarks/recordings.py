@@ -49,8 +49,8 @@ _AVIA_RATE = 60_000  # points/s
 _COMPARED = 12  # sweeps of a recording that are compared point by point
 _LATE, _CLOCK = 0.005, 0.010  # s: errors of a point's time, and of a clock, that count as noise
 _APART, _LONGER = 0.015, 0.10  # m: of two walls, RMS, and of two bores' lengths, that count as noise
-_DROPPED = 0.001  # share of the good points that may be left out, as is said
-_MOST_BAD = 0.05  # share of bad times that the reader states as its limit
+_DROPPED = 0.001  # fraction of the good points that may be left out, as is said
+_MOST_BAD = 0.05  # fraction of bad times that the reader states as its limit
 _ODDS: dict[str, dict[Any, int]] = {  # of each value of a convention
     "point_times": {"driver": 3, "header": 5, "sweep": 4, "epoch": 4, "boot": 6, "constant": 1, "none": 1},
     "point_unit": {"s": 1, "ms": 1, "us": 1, "ns": 1},

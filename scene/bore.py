@@ -32,7 +32,7 @@ class Bore:
     angle: Float[np.ndarray, " m"]  # Direction from `lateral` towards `up`, rad
     radius: Float[np.ndarray, "n m"]  # Smooth section about the centreline, m
     residual_rms: Float[np.ndarray, " n"]  # RMS distance of the section's inliers, m
-    coverage: Float[np.ndarray, " n"]  # Share of the section's angles seen
+    coverage: Float[np.ndarray, " n"]  # Fraction of the section's angles seen
     filled: Bool[np.ndarray, " n"]  # Section interpolated
     ring_station: Float[np.ndarray, " r"]  # Ring joints, m
     pocket: Shaped[np.ndarray, " p"]  # Recesses of the lining, `(p,)` of `POCKET`

@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
-_LINE_EVERY, _LINE_SHARE = 10.0, 0.1  # s, and share of a stage, between two lines where there is no terminal
+_LINE_EVERY, _LINE_SHARE = 10.0, 0.1  # s, and fraction of a stage, between two lines where there is no terminal
 
 
 class _Rate(ProgressColumn):

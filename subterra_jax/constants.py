@@ -75,7 +75,7 @@ FAULT_SPREAD = 2.0 / 3.0
 ORIGIN_DISTANCE_SIGMA, ORIGIN_HEADING_SIGMA = 0.05, 0.005  # m, rad
 
 # LiDARs in three dimensions: range noise, what each metre and each unit of the tangent of incidence add to it, returns
-# lost, share of mixed pixels where these are asked for.
+# lost, fraction of mixed pixels where these are asked for.
 SPATIAL_SIGMA, SPATIAL_SIGMA_PER_METRE, SPATIAL_SIGMA_SLANT = 0.019, 1e-4, 0.002  # m, m/m, m
 SPATIAL_LOST, SPATIAL_MIXED = 0.004, 0.1  # 1, 1
 SPATIAL_HEIGHT = 0.7  # m above the ground

@@ -37,7 +37,7 @@ def not_negative(config: Any, *names: str) -> None:
 
 
 def share(config: Any, *names: str) -> None:
-    """Raises `ConfigError` where one of the settings is no share."""
+    """Raises `ConfigError` where one of the settings is no fraction."""
     for name in names:
         if not 0.0 <= getattr(config, name) <= 1.0:
             raise ConfigError(f"{name} must lie between 0 and 1, got {getattr(config, name)}")
@@ -75,7 +75,7 @@ class TrainConfig:
     # drives by its mean, and that of a broad one stops short of where its draws do. None sets no limit.
     last_std: float | None = None
     learning_rate: float = 4e-4  # learning rate of Adam, at the start and at most
-    last_rate: float = 1.0  # share of the learning rate that is left in the last iteration; it falls evenly
+    last_rate: float = 1.0  # fraction of the learning rate that is left in the last iteration; it falls evenly
     # the learning rate falls where an update moves the policy further than about this divergence; 0 keeps it
     # constant
     target_kl: float = 0.0
@@ -94,12 +94,12 @@ class TrainConfig:
     drive_steps: int = 300  # steps of each
     drives_minibatch: int = 64  # drives in one step of the localiser's optimiser
     localiser_rate: float = 2e-3  # its learning rate, at most
-    # training ends once the rolling-100 coverage is at least this (a share of the tunnel) and every one of those
+    # training ends once the rolling-100 coverage is at least this (a fraction of the tunnel) and every one of those
     # episodes succeeded; a value above 1 never stops
     stop_coverage: float = 2.0
     stop_patience: int = 40  # for how many iterations in a row that must hold
     checkpoint_every: int = 50  # iterations between checkpoints; one is written at the end in any case
-    # Parts that the environments are split into, each with draws of its own. As many devices as divide them share
+    # Parts that the environments are split into, each with draws of its own. As many devices as divide them fraction
     # them out; the result does not depend on how many those are.
     parts: int = 1
     # `ordered`: one seed gives one result on a GPU as well. `any`: a GPU adds up in any order.

@@ -15,8 +15,8 @@ from subterra_jax.policies.locate.streams import Record
 from subterra_jax.rules.rule import Choice
 from train.driver import Driver, Policy
 
-_FULL = 0.6  # share of drives at full speed
-_AS_THE_TASK = 0.4  # share of drives that start where the task does
+_FULL = 0.6  # fraction of drives at full speed
+_AS_THE_TASK = 0.4  # fraction of drives that start where the task does
 _SLOWEST = 0.5  # of full speed
 _LEAST = 0.2  # of full speed: a drive goes on
 _END = 5.0  # m before the end of the tunnel at which a drive ends
@@ -106,7 +106,7 @@ def _starts(env: Any, params: Any, keys: Array, n: int, room: Any) -> Any:
 
 
 def _pace(key: PRNGKeyArray) -> Float[Array, "4"]:
-    """Draws how a robot drives: mean share of full speed, swing, period in steps, phase."""
+    """Draws how a robot drives: mean fraction of full speed, swing, period in steps, phase."""
     u = jax.random.uniform(key, (5,))
     mean = _SLOWEST + (1.0 - _SLOWEST) * u[1]
     mean, swing = jnp.where(u[0] < _FULL, 1.0, mean), jnp.where(u[0] < _FULL, 0.0, 0.2 * u[2])
@@ -114,5 +114,5 @@ def _pace(key: PRNGKeyArray) -> Float[Array, "4"]:
 
 
 def _speed(pace: Float[Array, "4"], t: Array) -> Float[Array, ""]:
-    """Returns the share of full speed at step `t`."""
+    """Returns the fraction of full speed at step `t`."""
     return jnp.clip(pace[0] + pace[1] * jnp.sin(6.28 * t / pace[2] + pace[3]), 0.2, 1.0)

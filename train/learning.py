@@ -133,7 +133,7 @@ def advantages(
 def clipped_objective(
     log_ratio: Float[Array, "*batch"], advantage: Float[Array, "*batch"], clip: float
 ) -> dict[str, Float[Array, ""]]:
-    """Computes PPO's clipped policy loss, the divergence from the old policy, and the share of clipped samples.
+    """Computes PPO's clipped policy loss, the divergence from the old policy, and the fraction of clipped samples.
 
     Args:
         log_ratio: New less old log density of the actions.

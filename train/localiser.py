@@ -21,7 +21,7 @@ from train.map_target import MapCase, draw_cases, map_loss
 _WARM = 50.0  # steps of the optimiser
 _LAST_RATE = 0.02  # of the learning rate, at the end
 _SHORT = 30  # metres; errors over so short a way count too
-_FAR = 100  # metres from which on the share of right estimates is logged
+_FAR = 100  # metres from which on the fraction of right estimates is logged
 _MOST = 5.0  # standard scales of an error beyond which a single drive has no further say
 _CHUNK = 16  # drives whose gradients are computed at once
 

@@ -13,7 +13,7 @@ from subterra_jax.policies.locate.blocks import DELAY
 from subterra_jax.policies.locate.map_strip import MapStrip
 from train.drives import Drives
 
-_HIDDEN, _WRONG = 0.5, 0.2  # shares of the drives whose start is hidden, and whose map is of another place
+_HIDDEN, _WRONG = 0.5, 0.2  # fractions of the drives whose start is hidden, and whose map is of another place
 _APART = 50.0  # m from the true place to that of a wrong map, at least
 
 

@@ -19,7 +19,7 @@ class Finished:
     """The episodes that ended during an unroll, in place: read a field only where `done`."""
 
     done: Bool[Array, "time env"]  # the step was its episode's last
-    coverage: Float[Array, "time env"]  # share of the tunnel covered, 0 to 1
+    coverage: Float[Array, "time env"]  # fraction of the tunnel covered, 0 to 1
     success: Bool[Array, "time env"]  # the task's goal was met
     contact: Bool[Array, "time env"]  # the episode ended at a wall or an obstacle
     episode_return: Float[Array, "time env"]  # undiscounted reward of the episode

@@ -25,10 +25,10 @@ _AGENTS = tuple(entry.name for entry in ROSTER)
 class Score:
     """Success of an agent in one column, or over several."""
 
-    success: float  # Share of the episodes, 0 to 1
+    success: float  # Fraction of the episodes, 0 to 1
     low: float  # Lower end of its 95 % interval, by a bootstrap of seeds within tunnels
     high: float  # Upper end
-    contact: float  # Share of the episodes that end at a wall or a box
+    contact: float  # Fraction of the episodes that end at a wall or a box
     median_error: float | None  # Median distance from the goal at the stop, m; None where nobody stopped
     floor: float | None  # Success that theory allows without a look at the walls; None where it is not known
     n: int  # Episodes

@@ -83,7 +83,7 @@ def screen_markdown(cells: Cells, split: str = SPLIT) -> str:
 
 
 def percent(share: float | None) -> str:
-    """Return a share in whole per cent; a dash for None."""
+    """Return a fraction in whole per cent; a dash for None."""
     return "-" if share is None else f"{100 * share:.0f}"
 
 

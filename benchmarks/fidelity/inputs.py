@@ -175,7 +175,7 @@ class SplitConfig:
 
     block: float = 2.0  # Length of a block, s.
     guard: float = 0.2  # Left out around every border between parts, s.
-    shares: tuple[float, float, float] = (0.6, 0.2, 0.2)  # Shares of fit, val and hold.
+    shares: tuple[float, float, float] = (0.6, 0.2, 0.2)  # Fractions of fit, val and hold.
     seed: int = 0  # Seed of the order of the blocks.
 
 
@@ -268,7 +268,7 @@ def _part_name(part: str, recording: Path) -> str:
 
 _BESIDE = 2.0  # largest radii from the axis at which a sensor or a return is still in the tunnel
 _FEWEST = 30  # returns that show a metre of the tunnel
-_SHOWN = 0.95  # share of the tunnel that must be shown
+_SHOWN = 0.95  # fraction of the tunnel that must be shown
 _THINNED = 200_000  # returns that are looked at
 
 

@@ -32,7 +32,7 @@ def find_leaks(case: Case, values: dict[str, Value], recorded: str | None = None
 
 
 def duplicate_share(hold: Hold, fit: Hold) -> float:
-    """Return the share of held-out points with an exact duplicate among those of the fit."""
+    """Return the fraction of held-out points with an exact duplicate among those of the fit."""
     rows, known = (np.round(recording.points, 6) + 0.0 for recording in (hold, fit))
     alike = rows[np.isin(rows[:, 0], known[:, 0])]  # few: a set of all points takes 0.3 GiB
     others = {row.tobytes() for row in known[np.isin(known[:, 0], alike[:, 0])]}

@@ -9,7 +9,7 @@ from benchmarks.fidelity.registry import Value
 from benchmarks.fidelity.table import Metric
 
 GATE_FLOOR = 50.0  # points; a gate below it caps its category at it
-MOST_MISSING = 0.30  # share of a category's metrics
+MOST_MISSING = 0.30  # fraction of a category's metrics
 PASS_GLOBAL = 90.0
 PASS_CATEGORY = 70.0
 PASS_LEAD = 10.0  # points above the null tube
@@ -35,7 +35,7 @@ class Scored:
     categories: dict[str, float | None]  # Score by category; `None` where too much of it is missing
     failed_gates: tuple[str, ...]  # Ids of gates below 50
     overall: float | None  # Mean of the categories that have a score; `None` where none has
-    saturated: float  # Share of scored metrics at exactly 100
+    saturated: float  # Fraction of scored metrics at exactly 100
 
     @property
     def evaluated(self) -> int:

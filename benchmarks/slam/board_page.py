@@ -115,7 +115,7 @@ def _cell(rows: list[Row], program: str, recording: str) -> str:
 
 
 def _sums(rows: list[Row], program: str) -> list[str]:
-    """Returns the medians of the error across, the reach and the share of real time."""
+    """Returns the medians of the error across, the reach and the fraction of real time."""
     some = [row for row in rows if row["program"] == program and "failed" not in row]
     reach = [row["reach"] for row in some if row["reach"] is not None]
     parts: tuple[tuple[list[float], Callable[[float], str]], ...] = (

@@ -35,7 +35,7 @@ class Score:
 
     name: str  # Name of the recording
     distance: float  # True distance driven between the first and the last scored time, m
-    covered: float  # Scored share of the recording's duration
+    covered: float  # Scored fraction of the recording's duration
     poses: int  # Number of scored poses
     alignment: str  # Alignment of the estimate
     axis: str  # Origin of the directions
@@ -94,7 +94,7 @@ def score_files(
 
 
 LEAST_RATE = 1.0  # poses a second; fewer leave out where a program errs
-LEAST_COVERED = 0.9  # share of a recording below which an estimate is none
+LEAST_COVERED = 0.9  # fraction of a recording below which an estimate is none
 REACH_ERROR = 1.0  # m
 _LEAST_AFTER = 1.0  # s after the truth's end that a program may still report
 
@@ -125,7 +125,7 @@ def _check_place(estimate: Path, track: Track) -> None:
         )
 
 
-_TURNED, _FITS = 0.3, 0.05  # share of the distance: RMS errors as aligned at the start, and after the best fit
+_TURNED, _FITS = 0.3, 0.05  # fraction of the distance: RMS errors as aligned at the start, and after the best fit
 
 
 def _check_frame(estimate: Path, track: Track) -> None:

@@ -108,7 +108,7 @@ class Track:
     rotation: Rotation  # Estimated attitudes, `n` of them
     true_position: Float[np.ndarray, "n 3"]  # True positions, m
     true_rotation: Rotation  # True attitudes, `n` of them
-    covered: float  # Share of the truth's duration between the first and the last of these times
+    covered: float  # Fraction of the truth's duration between the first and the last of these times
     after: float  # Time for which the estimate goes on after the truth's end, s
     late: float | None = None  # By how much the turns show the estimate's clock to be late, s; from 10 ms on
 

@@ -23,7 +23,7 @@ class Loop:
 
     reset: Callable[[PRNGKeyArray, Any], Carry]  # Maps key and params to observations and state
     # Maps key, observations and state, and params to new observations and state, a scalar that depends on all other
-    # outputs of the step, and the share of environments whose episode ended
+    # outputs of the step, and the fraction of environments whose episode ended
     step: Callable[[PRNGKeyArray, Carry, Any], tuple[Carry, Float[Array, ""], Float[Array, ""]]]
     params: Any = None  # Constant inputs of the step; an argument of the compiled program, not a constant in it
 
@@ -46,7 +46,7 @@ class Speed:
     steps: int  # Steps in one call
     compile_seconds: float  # Time to trace and compile the call, s; not part of any other figure
     steps_per_second: list[float]  # Environment steps per second of each timed call
-    share_done: float  # Share of steps at which an episode ended
+    share_done: float  # Fraction of steps at which an episode ended
     checksum: float  # Sum of all outputs of all timed steps; the same for the same seed, device and versions
 
     @property

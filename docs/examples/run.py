@@ -1,7 +1,7 @@
 """Times another library's trainer on a task: `python docs/examples/run.py sb3_ppo --out sb3.json`.
 
 Each trainer has one file beside this one to copy from: its settings, the adapter, and how its policy is taken out. The
-command trains until a share of 100 fresh episodes succeeds, then drives listed episodes once.
+command trains until a fraction of 100 fresh episodes succeeds, then drives listed episodes once.
 """
 
 import argparse

@@ -22,7 +22,7 @@ from subterra_jax.tunnel_env import TunnelEnv
 
 GOAL = 0.9
 N_FRESH, FIRST_FRESH = 100, 10_000  # episodes of a score while training, and their first seed
-TURN = 0.2  # share of the yaw rate that eased actions reach
+TURN = 0.2  # fraction of the yaw rate that eased actions reach
 _BATCH = 500
 
 
@@ -112,7 +112,7 @@ class Score:
         steps: Environment steps trained so far.
         seconds: Wall-clock time of training so far, compiling included and scoring not, s.
         cpu_seconds: Processor time of this process alike, s.
-        success: Share of the fresh episodes that succeeded.
+        success: Fraction of the fresh episodes that succeeded.
     """
 
     steps: int
@@ -126,7 +126,7 @@ class Watch:
 
     Args:
         task: Task id.
-        goal: Share of episodes that must succeed.
+        goal: Fraction of episodes that must succeed.
         every: Least number of steps between two scores.
         report: Called with each score.
         **options: As for `st.make`.

@@ -25,12 +25,12 @@ from scene.geometry import Axis, bin_angles
 _COARSE = 0.15  # m, voxel of the cloud that is followed
 _REACH, _AROUND = 3.0, 5  # times the template, and directions around: as far as the wall is looked for
 _STRETCH = 3.0  # m between two stretches of what was removed
-_LITTLE = 0.002  # share of the points: with less to remove, the cloud is clean
+_LITTLE = 0.002  # fraction of the points: with less to remove, the cloud is clean
 _FEWEST = 200  # points
 _TRIED = 8  # seeds followed
-_ENCLOSED = 0.65  # share of the directions
+_ENCLOSED = 0.65  # fraction of the directions
 _ELONGATION = 1.6  # least length over width
-_ABOVE, _CROWN, _STREET = 0.8, 0.15, 7.0  # sine of directions above; share of them matched; m
+_ABOVE, _CROWN, _STREET = 0.8, 0.15, 7.0  # sine of directions above; fraction of them matched; m
 _FLAG = tyro.conf.arg(prefix_name=False)
 
 
@@ -186,7 +186,7 @@ def stand_in(tube: Tube, axis: Axis, at: Axis) -> Float[np.ndarray, "k rays"]:
 
 
 _FLAT = 0.04  # of the longest extent
-_OPEN = 0.6  # share of the unseen directions that lie above
+_OPEN = 0.6  # fraction of the unseen directions that lie above
 _THIN, _LOW = 0.3, 2.0  # m, heights between which a cloud may be a culvert or a pipe
 _NARROW = "no tunnel was found in the cloud: a bore under about 1.5 m is too narrow to be followed, "
 _TALL = 1.2  # times the larger extent in plan

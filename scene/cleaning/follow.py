@@ -40,8 +40,8 @@ class Seed:
     position: Float[np.ndarray, "3"]  # m
     direction: Float[np.ndarray, "3"]  # Unit vector along the bore
     radius: Float[np.ndarray, " rays"]  # Distance to the first return around, m; NaN where there is none
-    enclosed: float  # Share of the directions around in which there is a return
-    score: float  # Share of the returns seen from here, times the square of `enclosed`
+    enclosed: float  # Fraction of the directions around in which there is a return
+    score: float  # Fraction of the returns seen from here, times the square of `enclosed`
 
     @property
     def width(self) -> float:
@@ -168,7 +168,7 @@ _GATE = 0.5  # m from the template: further is another thing
 _REMEMBERED = 12  # sections in the template
 _RECENT = 3  # sections in the template of a section that changes fast
 _HEADED = 8  # m of way that give the direction
-_ENCLOSED = 0.62  # share of the directions matched
+_ENCLOSED = 0.62  # fraction of the directions matched
 _OPEN = 0.45  # share with any return near the template's size: less is no bore
 _SIZE = 2.2  # times the template
 _LONGEST_GAP = 15  # m without an enclosing section
@@ -328,7 +328,7 @@ def _lay(
 ) -> tuple[np.ndarray, float, float, np.ndarray]:
     """Return how far a section's middle is to the left and above of a place, and the section about it.
 
-    Between them: the share of its directions that match either template, and the share that match the longer one.
+    Between them: the fraction of its directions that match either template, and the share that match the longer one.
     """
     reach = _SIZE * float(template.max())
     near = points[tree.query_ball_point(position, reach)] - position

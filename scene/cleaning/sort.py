@@ -23,10 +23,10 @@ _TRACK = 0.60  # m above the floor: lower is track, kerb or walkway
 _FOOT = 1.2  # m: what has a part between these heights stands on the floor
 _CELL = 0.25  # m
 _ABOVE = 0.08  # m
-_END_ENCLOSED = 0.4  # share of the directions with wall
+_END_ENCLOSED = 0.4  # fraction of the directions with wall
 _RIM = 1.0  # m
-_FEW = 2e-4  # share of the points
-_USUAL = 0.5  # share of the rows that show a direction
+_FEW = 2e-4  # fraction of the points
+_USUAL = 0.5  # fraction of the rows that show a direction
 _ABOVE_SPRINGING, _MIN_ABOVE = 0.3, 8  # sine of the direction; directions
 _ELSEWHERE = 4.0  # times the wall
 

@@ -21,15 +21,15 @@ _OVERRUN = 4.0  # m beyond the axis that may still be bore
 COLUMNS = 120  # directions
 _BIN = 0.1  # m of radius
 _USUAL, _PRESENT, _BRIEF = 40.0, 4.0, 1.0  # m before and behind a station
-_PERSISTENT = 0.4  # share of the rows seen
+_PERSISTENT = 0.4  # fraction of the rows seen
 _MOSTLY = 0.5  # the same for the usual section
 _LEAST_ROWS = 3  # that show what persists
 _DIFFERENT = 0.3  # m
 _LAYBY = 7.0  # m: shorter is a niche
 _LONGER = (1 - 2 * _PERSISTENT) * (2 * _PRESENT + ROW)  # m by which what persists is longer than what is there
 _WIDEST, _WIDENED = 2.0, 2.6  # times the usual radius: a flare, and what lasts for the length of a lay-by
-_AROUND = 0.5  # share of the directions that change at once where the section changes
-_HIDDEN = 0.3  # share of the directions with returns behind: what is in front stands inside
+_AROUND = 0.5  # fraction of the directions that change at once where the section changes
+_HIDDEN = 0.3  # fraction of the directions with returns behind: what is in front stands inside
 _JUMP = 0.4  # m from one direction to the next
 
 
@@ -103,7 +103,7 @@ def measure_tube(
 
 _DOWN = -0.5  # sine of the highest direction in which a floor lies
 _BLOCK = 80  # rows
-_UNBROKEN, _FAINT = 0.8, 0.4  # share of the rows that show a floor; of its density, what lies below it
+_UNBROKEN, _FAINT = 0.8, 0.4  # fraction of the rows that show a floor; of its density, what lies below it
 _BELOW = 5  # bins
 
 
@@ -271,14 +271,14 @@ _STRIP = (0.08, 0.50)  # m below the ceiling, where a wall is looked for
 _SIDEWAYS = 0.95  # cosine of directions across
 _ROW = 1.0  # m of bore
 _APART = 0.1  # m between places on a wall
-_LAYER, _LEAST, _LEAST_SHARE = 0.06, 3, 0.04  # m, points, and share of a row's: fewer in so thin a layer are strays
+_LAYER, _LEAST, _LEAST_SHARE = 0.06, 3, 0.04  # m, points, and fraction of a row's: fewer in so thin a layer are strays
 _NEXT = 3  # rows: in one of so many the wall shows beside or above things
 _ALONG = 15  # rows in whose median a wall stays where it is
-_BEFORE, _SOME = 0.3, 0.03  # m before a wall, and share of the returns there, that things stand along it
+_BEFORE, _SOME = 0.3, 0.03  # m before a wall, and fraction of the returns there, that things stand along it
 _PROUD = 0.12  # m that things stand before a wall
 _LOW = 1.2  # m above the floor: what is lower and has no gap is a walkway, a kerb or a platform, and stays
-_FOOT, _GAPS = (0.06, 0.22), 0.08  # m above the floor; share of the rows that show the wall there
-# m above the floor, and share of the height: what shows nowhere between is a void above a ceiling, or a ledge
+_FOOT, _GAPS = (0.06, 0.22), 0.08  # m above the floor; fraction of the rows that show the wall there
+# m above the floor, and fraction of the height: what shows nowhere between is a void above a ceiling, or a ledge
 _MIDDLE = (0.3, 0.45)
 _DEEPEST = 1.6  # m: what lies further behind what is seen in most rows is another room
 

@@ -27,7 +27,7 @@ _SPACING = 1.0  # m between sections
 _PASSES = 4  # times that the axis is pulled to the middle
 _COARSE_ANGLES = 72  # directions of a section
 _POINTS_PER_METRE = 5_000  # more say no more of a middle
-_MIN_SEEN = 0.6  # share of the directions of a section that counts
+_MIN_SEEN = 0.6  # fraction of the directions of a section that counts
 _FURTHEST = 2.0  # times the median radius of a section: further is a passage, which has no part in its middle
 _DOWN, _TRACK = -0.8, 0.5  # directions in which sleepers and rails may hide the bed, and how deep, m
 
@@ -117,7 +117,7 @@ _NEXT = 3  # sections
 def _cut_begun(shown: Float[np.ndarray, " k"]) -> slice:
     """Return the sections without one at either end that is only begun: its middle would bend the axis.
 
-    A mouth cuts it off aslant, and of what lies before a mouth there is no crown. `shown` is the share of each
+    A mouth cuts it off aslant, and of what lies before a mouth there is no crown. `shown` is the fraction of each
     section's directions that show its wall.
     """
     if len(shown) < 4 * _NEXT:

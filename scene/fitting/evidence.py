@@ -117,7 +117,7 @@ def common_depth(sections: Sections, holes: Holes, slope: np.ndarray) -> float:
 _BEYOND_RIM = 2  # cells beyond the edge of a hole in which the wall must stand again
 _BEHIND = 0.055  # m, four to five standard deviations of a wall: a return further out lies behind it
 _EXPECTED = (31, 21)  # cells of 5 cm × 1° over which the wall is alike
-_LEAST_BEHIND = 1 / (_EXPECTED[0] * _EXPECTED[1])  # share of the wall's cells with a return behind: one among them
+_LEAST_BEHIND = 1 / (_EXPECTED[0] * _EXPECTED[1])  # fraction of the wall's cells with a return behind: one among them
 _MOUTH = (9, 7)  # cells about the middle of a hole that are no wall
 _PRIOR = 1.0  # points on the wall, or holes, that a cell of the looks starts with as wall
 _SHIFTS = [(row, column) for row in (-1, 0, 1) for column in (-1, 0, 1)]
@@ -138,9 +138,9 @@ def open_rims(
     size: tuple[float, float],
     radius: float,
 ) -> Float[np.ndarray, " p"]:
-    """Return the share of the wall that is missing around each hole: about 0 for a pocket, 1 for a shadow's part.
+    """Return the fraction of the wall that is missing around each hole: about 0 for a pocket, 1 for a shadow's part.
 
-    `deficit` is the share of the wall's returns that each cell lacks. The middle of a hole is given in cells, its
+    `deficit` is the fraction of the wall's returns that each cell lacks. The middle of a hole is given in cells, its
     length and width, and the distance of the wall from the axis, `radius`, in m.
     """
     smooth = uniform_filter(deficit, (3, 3), mode=MODES)
@@ -156,7 +156,7 @@ def open_rims(
 def pocket_over_wall(sections: Sections, holes: Holes, size: tuple[float, float]) -> Float[np.ndarray, " p"]:
     """Return how much likelier the returns about each hole are with a pocket there than with wall, as a logarithm.
 
-    A cell has points on the wall by Poisson's law, of the mean that the wall around has, or of the share of it that
+    A cell has points on the wall by Poisson's law, of the mean that the wall around has, or of the fraction of it that
     clear holes leave; and has returns behind the wall as often as the wall around or, more, as clear holes do. The
     middle may be a cell off, each way as likely. Cells are taken as independent. Without clear holes the result is 0.
 
@@ -200,7 +200,7 @@ def _wall_around(
 def _looks_of(
     clear: Holes, fields: tuple[np.ndarray, ...], reach: tuple[int, int]
 ) -> tuple[Float[np.ndarray, "r c"], Float[np.ndarray, "r c"]]:
-    """Share of the wall's points that clear holes leave in each cell, and the chance that they show one behind it.
+    """Fraction of the wall's points that clear holes leave in each cell, and the chance that they show one behind it.
 
     `fields` are points on the wall, those without a hole, whether one lies behind, and the chance of it without a hole.
     """

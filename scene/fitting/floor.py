@@ -108,7 +108,7 @@ class _Layer:
 
     worth: float  # Score among the layers of all slopes; 0 where it is no floor.
     line: tuple[float, float]  # Height at the axis (m) and slope.
-    extent: float  # Share of the strips whose lowest returns lie in it.
+    extent: float  # Fraction of the strips whose lowest returns lie in it.
     # Height of each strip's lowest returns above it, m; `inf` where a strip shows nothing.
     bottoms: Float[np.ndarray, " strips"]
 
@@ -233,7 +233,7 @@ def find_floors(
 
 
 _ENOUGH, _LONGEST_WINDOW = 1000, 4.0  # points that show a floor beside sleepers; m
-_MIDDLE, _PIT, _PIT_SHARE = 1.2, 0.5, 0.05  # m beside the axis; m below its floor; share of the returns that low
+_MIDDLE, _PIT, _PIT_SHARE = 1.2, 0.5, 0.05  # m beside the axis; m below its floor; fraction of the returns that low
 
 
 def _lines_beside_pit(lateral: np.ndarray, upward: np.ndarray) -> list[tuple[float, float]]:

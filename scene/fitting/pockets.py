@@ -118,7 +118,7 @@ def find_pockets(sections: Sections) -> tuple[Shaped[np.ndarray, " p"], Float[np
     """
     expected = uniform_filter(sections.support, _EXPECTED, mode=MODES)
     share = sections.support / np.maximum(expected, 1e-9)
-    # Share of the wall's returns that each cell lacks against those around it: 0 none, 1 all.
+    # Fraction of the wall's returns that each cell lacks against those around it: 0 none, 1 all.
     deficit = np.where((expected > _MIN_EXPECTED) & ~_near_floor(sections), np.clip(1 - share, -1, 1), 0.0)
     faint = _find_holes(deficit, sections)
     weak = faint.where(faint.score > _WEAK)

@@ -31,7 +31,7 @@ class RingFit:
     centre: Float[np.ndarray, "r 3"]  # m
     radius: Float[np.ndarray, " r"]  # m
     rms: Float[np.ndarray, " r"]  # Distance of the points from the circle, m
-    seen: Float[np.ndarray, " r"]  # Share of the circumference within 22.5° of a point
+    seen: Float[np.ndarray, " r"]  # Fraction of the circumference within 22.5° of a point
 
 
 def fit_rings(survey: RingSurvey) -> RingFit:

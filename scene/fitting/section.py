@@ -21,8 +21,8 @@ from scene.geometry import N_ANGLES, Around, Axis, angle_bins, find_runs
 DENSE_STEP = 0.25  # m; where fewer than most rows of this length were seen, the survey is a row of profiles
 OVERRUN = 3.0  # m beyond the axis that are looked at
 _GAP = 2.0  # m unseen along the bore: longer is a gap of the survey, and no distance of its profiles
-_END_COVERAGE = 0.4  # share of the directions that a row of the bore shows
-_DENSE = 0.7  # share of the rows that a dense survey shows
+_END_COVERAGE = 0.4  # fraction of the directions that a row of the bore shows
+_DENSE = 0.7  # fraction of the rows that a dense survey shows
 _TRIM_STEP = 0.05  # m
 
 
@@ -90,13 +90,13 @@ _ON_WALL = 0.035  # m from the wall: nearer returns are on it
 _LARGE_HOLE = 4.0  # cells
 _GOES_ON = 1.0  # m that a wall goes on as it was, where it is unseen from there to the end
 _ALONG = 1.25  # m before and behind a cell that tell an edge from a pocket
-_MOSTLY, _MIN_CELLS = 0.7, 6  # share of the cells seen, and how many
+_MOSTLY, _MIN_CELLS = 0.7, 6  # fraction of the cells seen, and how many
 _WIDE = 6  # columns
 _STEEP, _EDGE = 0.25, 1.0  # of the radius, within 4 columns; m that the first wall may be off there
 _DEEPEST = 0.40  # further out is no recess of a lining, m
 _SEEN_WEIGHT = 0.02  # returns a cell: with fewer around, the first wall stands
-_MIN_COVERAGE = 0.5  # share of the cells of the first wall
-_HOLLOW, _MIN_HOLLOW = 0.5, 0.7  # m from the wall, share of the points
+_MIN_COVERAGE = 0.5  # fraction of the cells of the first wall
+_HOLLOW, _MIN_HOLLOW = 0.5, 0.7  # m from the wall, fraction of the points
 
 
 @dataclass(frozen=True)

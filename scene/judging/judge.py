@@ -1,4 +1,4 @@
-"""The built bore against all that was registered: shares, places, unseen wall, and whether to warn or to refuse."""
+"""The built bore against all that was registered: fractions, places, unseen wall, and whether to warn or to refuse."""
 
 from dataclasses import dataclass
 from typing import Annotated, Any
@@ -38,7 +38,7 @@ class JudgingConfig:
     """Limits by which a built bore is judged against all returns."""
 
     tolerance: float = 0.10  # A return this near to the model is explained by it, m.
-    warn_above: float = 0.05  # Share of unexplained returns between the ends above which the build warns.
+    warn_above: float = 0.05  # Fraction of unexplained returns between the ends above which the build warns.
     refuse_above: float = 0.35  # Share above which it fails; what was cut away as another bore or terrain is left out.
     force: Annotated[bool, _FLAG] = False  # Build all the same where the judgement would refuse.
 
@@ -63,12 +63,12 @@ class Judgement:
     returns: Returns | None = None  # All returns about the bore; `None` for a ring survey
     coverage: Coverage | None = None  # Unseen wall
     places: tuple[Place, ...] = ()  # Unexplained returns, the largest place first
-    scattered: float = 0.0  # Share of the returns between the ends that are unexplained and belong to no place
+    scattered: float = 0.0  # Fraction of the returns between the ends that are unexplained and belong to no place
     worst: tuple[tuple[float, float, float], ...] = ()  # First and last station, m, and share unexplained
 
     @property
     def shares(self) -> dict[str, float]:
-        """Shares of the returns: `explained`, `inside` and `behind` of those between the ends, `beyond` of all."""
+        """Fractions of the returns: `explained`, `inside` and `behind` of those between the ends, `beyond` of all."""
         kinds = {"explained": EXPLAINED, "inside": INSIDE, "behind": BEHIND, "beyond_ends": BEYOND}
         return {} if self.returns is None else {name: self.returns.share(kind) for name, kind in kinds.items()}
 
@@ -86,7 +86,7 @@ class Judgement:
         }  # fmt: skip
 
     def summary(self) -> str:
-        """Return the shares in one line for people."""
+        """Return the fractions in one line for people."""
         if self.returns is None:
             return "judged: a ring survey holds no returns to judge by"
         share = self.shares
@@ -212,7 +212,7 @@ def _warn_of_places(places: tuple[Place, ...], tolerance: float) -> list[Warned]
 
 
 def _worst_windows(bore: Bore, returns: Returns) -> tuple[tuple[float, float, float], ...]:
-    """Windows with the largest share of unexplained returns, which do not touch."""
+    """Windows with the largest fraction of unexplained returns, which do not touch."""
     count = max(int(bore.length / _WINDOW), 1)
     edges = np.linspace(0.0, bore.length, count + 1)
     total, wrong = (

@@ -169,7 +169,7 @@ _KEY = (
     '<p class="key"><i style="background:#9aa5b1"></i>on the model<i style="background:#d64545"></i>inside the bore'
     '<i style="background:#2f6fde"></i>behind the wall<i style="background:#c9a227"></i>beyond the ends</p>'
 )
-_LEAST_SHOWN = 0.002  # a station whose unexplained share is less makes no picture
+_LEAST_SHOWN = 0.002  # a station whose unexplained fraction is less makes no picture
 
 
 def render_page(name: str, bore: Bore, judgement: Judgement, content: dict[str, Any]) -> str:

@@ -57,7 +57,7 @@ class Returns:
         return self.kind != BEYOND
 
     def share(self, kind: int) -> float:
-        """Return the share of one kind in all returns, `BEYOND`, or in those between the ends, the others."""
+        """Return the fraction of one kind in all returns, `BEYOND`, or in those between the ends, the others."""
         rows = np.ones(len(self.kind), bool) if kind == BEYOND else self.in_span
         total = float(self.weight[rows].sum())
         return float(self.weight[self.kind == kind].sum()) / total if total else 0.0
@@ -179,7 +179,7 @@ _CELL = 0.4  # m, edge of the boxes that join returns to a place
 _MIN_IN_CELL = 3  # points: a box with fewer holds strays
 _MIN_POINTS = 30  # of a place
 _WIDEST = 15.0  # m from the axis; what lies further is gathered by station alone
-_SLACK = 1.0  # m added to a place at both ends where its share of the returns is taken
+_SLACK = 1.0  # m added to a place at both ends where its fraction of the returns is taken
 
 
 @dataclass(frozen=True)
@@ -281,7 +281,7 @@ class Coverage:
 
     @property
     def share(self) -> float:
-        """Share of the cells that were seen."""
+        """Fraction of the cells that were seen."""
         return float(self.seen.mean())
 
 

@@ -24,10 +24,10 @@ _LEAST_POINTS = 24  # points of a place
 _NEAR_WALL = 0.30  # m
 _LOWEST = -0.3  # sine of the lowest direction: sleepers and ballast below it are two layers, too
 _THINNEST = 0.02  # m between two layers; nearer is noise
-_APART = 0.92  # share of the variance that lies between two halves: 0.64 of one noisy layer, 0.75 of an even one
-_HALF = 0.15  # least share of the points in each layer
+_APART = 0.92  # fraction of the variance that lies between two halves: 0.64 of one noisy layer, 0.75 of an even one
+_HALF = 0.15  # least fraction of the points in each layer
 _MIXED = 0.5  # of the neighbours in other layers that points at random would have
-_DOUBLED = 0.25  # share of the places
+_DOUBLED = 0.25  # fraction of the places
 _WINDOW = 10.0  # m
 
 
@@ -291,7 +291,7 @@ def doubt_shaft(bore: Bore, axes: str) -> list[Warned]:
     )]  # fmt: skip
 
 
-_FEW = 0.5  # share of the sleepers seen: with fewer, their places are the spacing's
+_FEW = 0.5  # fraction of the sleepers seen: with fewer, their places are the spacing's
 
 _THIN = "the returns on the floor are too few to show any, or their sleepers: a track is easily missed"
 

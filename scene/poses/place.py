@@ -39,7 +39,7 @@ class Located:
     # `poses`, `length_fixed_by`, `length_uncertainty` (m, 95 %, or `None` where nobody can say) and figures
     facts: dict[str, Any]
     estimated: bool = True  # True where the poses were estimated here and are written to the scene
-    most_uncovered: float = 0.05  # Share of the scans that may lie outside the trajectory's time
+    most_uncovered: float = 0.05  # Fraction of the scans that may lie outside the trajectory's time
 
 
 _GIVEN = {  # only their maker knows how well they fix the length
@@ -86,7 +86,7 @@ def locate_by_odometry(recording: Recording, calibration: Calibration, progress:
 # Guides: what is trusted of the turn (rad) and the shift (m) from one sweep to the next.
 _BY_CONTROL = (np.deg2rad(0.1), 0.02)
 _OUTLIER = 4.0  # standard deviations
-_MOST_WITHOUT_CONTROL = 0.5  # share of the scans
+_MOST_WITHOUT_CONTROL = 0.5  # fraction of the scans
 _END_ERROR = 0.05  # m; an end of the bore is found to this, on simulated surveys
 
 

@@ -49,7 +49,7 @@ def register_scans(
     """Places every return in a cloud thinned to `voxel`, m, and keeps some of those below the LiDAR as they are.
 
     Scans that the trajectory does not cover are left out. Raises `RecordingError` where they are more than
-    `most_uncovered`, a share, and `FitError` where no point is left.
+    `most_uncovered`, a fraction, and `FitError` where no point is left.
     """
     thinned, low, batch = VoxelMean(voxel), [np.empty((0, 3))], list[np.ndarray]()
     placed, uncovered, every = 0, 0, 1

@@ -96,7 +96,7 @@ class NormalEquations:
     def solve(self, damping: float = 0.0) -> Float[np.ndarray, "n s"]:
         """Return the step that lowers the cost; raises `FitError` where some unknown is not determined.
 
-        `damping` is the share of the diagonal added to it (Levenberg-Marquardt).
+        `damping` is the fraction of the diagonal added to it (Levenberg-Marquardt).
         """
         band = self._band.copy()
         band[0] *= 1.0 + damping

@@ -15,7 +15,7 @@ from scene.reading.tables import given_columns
 
 _COARSE, _HOPELESS = 0.02, 0.25  # m: coordinates rounded so far are reported, and refused
 _REPEATED = 10  # points for each value of a coordinate: on a grid they repeat
-_MOST_OUTSIDE = 0.5  # share of the points that may lie too far from the first to be thinned
+_MOST_OUTSIDE = 0.5  # fraction of the points that may lie too far from the first to be thinned
 
 
 def read_cloud(

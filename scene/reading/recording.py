@@ -16,7 +16,7 @@ from scene.reading.scans import ScanSource
 from scene.reading.source import refuse_damage
 from scene.reading.times import MOST_BAD, SHORT, WHOLE, Convention, RawScan, Scan, Spans, TimeConfig, join_scans
 
-_MOST_OUT_OF_ORDER = 0.05  # share of the scans
+_MOST_OUT_OF_ORDER = 0.05  # fraction of the scans
 _LONGEST_PAUSE = 3600.0  # s; a stamp further from the last one is damage, and would make all later ones look late
 
 

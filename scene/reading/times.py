@@ -29,12 +29,12 @@ _LEAP = 1.0  # s by which an offset changes at once where a clock begins anew
 _FEWEST = 4  # sweeps between two such leaps, by the offset that they have in common
 _WIDE = 1.5  # times the reach of a sweep from its middle: further is no time of that sweep
 SHORT, WHOLE = 0.075, 0.1  # s: messages closer than that are parts of a sweep, or quick ones; what they are joined to
-MOST_BAD = 0.05  # share of all points without a time of their sweep
+MOST_BAD = 0.05  # fraction of all points without a time of their sweep
 _SAMPLE = 4000  # points of a sweep by which its span is found
 _MOST, _AROUND = 0.85, 3.0  # share of the points that lie about the median; how much further a time of theirs may lie
 _LONG = 0.95  # quantile of the spans of all sweeps that is the length of one: of some the first or last beams are lost
 _COUNTER = 2.0**32  # values of a counter of 32 bits
-_LIKE = 0.1  # of the spread that a share of a sweep has: times with less of it are alike
+_LIKE = 0.1  # of the spread that a fraction of a sweep has: times with less of it are alike
 _FARTHEST = 1e7  # m; no sensor sees so far
 _FLAG = tyro.conf.arg(prefix_name=False)
 

@@ -184,7 +184,7 @@ def draw_reflectivity(
 DOPPLER_SIGMA = 0.03  # m/s. Source: Aeva's Aeries II, 3 cm/s
 _INSTANT = 0.005  # s to either side, over which the sensor's speed is taken
 _RAYS_AT_ONCE = 240_000  # large enough for numpy, small enough for the memory
-_SECOND_RETURN = 0.02  # share of returns marked as second ones
+_SECOND_RETURN = 0.02  # fraction of returns marked as second ones
 
 
 def n_sweeps(carried: Carried, every: int) -> int:

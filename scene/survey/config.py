@@ -23,10 +23,10 @@ class SensorErrors:
     range_noise_per_metre: float = 1e-4  # Standard deviation that each metre of range adds in quadrature, m/m.
     # Standard deviation added in quadrature per unit tangent of the incidence angle (up to 10), m.
     incidence_noise: float = 0.002
-    mixed_pixels: float = 0.1  # Share of the beams across a depth edge whose return falls between the two surfaces.
+    mixed_pixels: float = 0.1  # Fraction of the beams across a depth edge whose return falls between the two surfaces.
     # Lose returns whose echo is too weak for the sensor, by range, incidence, material and speckle.
     weak_echoes: bool = True
-    lost: float = 0.004  # Share of returns lost for no reason modelled here.
+    lost: float = 0.004  # Fraction of returns lost for no reason modelled here.
     # Measure each point from the pose of its own time; otherwise whole sweeps from that of their stamp.
     distortion: bool = True
     imu_noise: bool = True  # White noise of accelerometer and gyroscope, and wander of the orientation.

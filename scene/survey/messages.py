@@ -204,12 +204,12 @@ class Convention:
     point_field: Annotated[str, _FLAG] = "timestamp"  # Name of that field.
     header_of: Annotated[Literal["start", "end"], _FLAG] = "start"  # Part of a sweep that its header is of.
     boot: Annotated[float, _FLAG] = 320.0  # Time that the sensor had run at the first sweep, s.
-    bad_times: Annotated[float, _FLAG] = 0.0  # Share of the points whose time is that of no sweep.
+    bad_times: Annotated[float, _FLAG] = 0.0  # Fraction of the points whose time is that of no sweep.
     by_ring: Annotated[bool, _FLAG] = False  # Points in the order of rings, not of time.
     # What stands for a beam without return: nothing, a point in the sensor itself, or numbers that are none.
     empty: Annotated[Literal["left out", "zero", "nan"], _FLAG] = "left out"
     pieces: Annotated[int, _FLAG] = 1  # Messages that a sweep is published in, one after another.
-    missing: Annotated[float, _FLAG] = 0.0  # Share of the messages that never came.
+    missing: Annotated[float, _FLAG] = 0.0  # Fraction of the messages that never came.
     big_endian: Annotated[bool, _FLAG] = False  # Numbers of points with their highest byte first.
     imu_late: Annotated[float, _FLAG] = 0.0  # How much later the IMU's clock is than the LiDAR's, s.
     container: Annotated[Literal["bag", "mcap", "db3"], _FLAG] = "bag"  # A bag of ROS 1, or a folder of ROS 2.

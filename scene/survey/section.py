@@ -48,7 +48,7 @@ CELL = 0.10  # m, largest cell of the surface grid
 _OUTLINE_STEP = 1e-3  # m between the points of an outline before it is sampled
 _HALF_POCKET = 0.5 * POCKET_WIDTH * np.array([-1.0, 0.0, 1.0])  # m: first edge, middle, last edge of a pocket
 # Middles of the rows of pockets: on the wall in m above the floor (the first 0.70 m above the sleepers), on the crown
-# as a share of the height, which in the paper's D is 35° and 70° above the springing.
+# as a fraction of the height, which in the paper's D is 35° and 70° above the springing.
 _WALL_ROWS = (SLEEPER_RISE + 0.70, 2.20)
 _CROWN_ROWS = ((3.535 + 2.825 * np.sin(np.deg2rad([35.0, 70.0]))) / 6.36).tolist()
 

@@ -32,14 +32,14 @@ class GaitParams:
     """Parameters of the trot."""
 
     frequency: float = 2.0  # strides per second
-    duty: float = 0.65  # share of a stride for which a foot is on the ground
+    duty: float = 0.65  # fraction of a stride for which a foot is on the ground
     height: float = 0.50  # height of the trunk's middle over the ground, m
     lift: float = 0.16  # height to which a foot is lifted, m: more than a sleeper stands out of the ballast
     spread: float = 0.035  # distance of the feet outside the legs' own planes, m
     still: float = 0.1  # commands below this, m/s (rad/s count half), are answered by standing on all feet
     startle: float = 0.3  # drift above which a standing robot steps to catch itself, m/s
     place: float = 0.18  # extra distance at which a foot is set down, per drift of the trunk, m per m/s
-    level: float = 1.2  # share of a measured tilt that the legs compensate
+    level: float = 1.2  # fraction of a measured tilt that the legs compensate
     learn: float = 0.75  # rate at which longer or shorter strides compensate a lasting drift, 1/s
     trim_max: float = 0.35  # largest such compensation, m/s and rad/s
     # fastest change of the commanded velocity, m/s² and rad/s²
@@ -99,7 +99,7 @@ def _foot_offsets(state: GaitState, drift: Float[Array, "2"], period: float, par
 
 
 def stance(state: GaitState, params: GaitParams) -> Float[Array, "4"]:
-    """Return the planned share of load of each leg: 1 on the ground, 0 in the air, with short ramps between."""
+    """Return the planned fraction of load of each leg: 1 on the ground, 0 in the air, with short ramps between."""
     phase = _leg_phase(state)
     edge = 0.05
     on = jnp.clip(jnp.minimum(phase, params.duty - phase) / edge + 0.5, 0.0, 1.0)

@@ -11,7 +11,7 @@ from subterra_jax.physics.engine import Body
 from subterra_jax.physics.ground import SPACING, Track
 from subterra_jax.physics.rotations import inverse, rotate
 
-_FOLLOW = 0.35  # share of a new reading in the smoothed speed
+_FOLLOW = 0.35  # fraction of a new reading in the smoothed speed
 _FIELDS = {
     "rates": 3, "gravity": 3, "velocity": 2, "asked": 3, "commanded": 3, "trim": 3, "clock": 3, "angles": 12,
     "speeds": 12, "action": 12,

@@ -22,7 +22,7 @@ class CommandParams:
         low: Least velocity forward and to the left (m/s), and yaw rate (rad/s).
         high: Largest velocity and yaw rate.
         hold: Mean time for which a command is held, s; holding times are exponential.
-        still: Share of commands that ask to stand.
+        still: Fraction of commands that ask to stand.
         corridor: Largest distance from the axis that commands allow, m.
     """
 

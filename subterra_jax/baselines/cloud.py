@@ -48,8 +48,8 @@ class CloudParams:
     step_sigma: float | Float[Array, ""] = 0.01  # standard deviation of the noise of one step of dead reckoning, m
     # rate at which a particle changes between dry and wet rail, 1/m; 0 is never
     slip_rate: float | Float[Array, ""] = 0.0
-    slip_loss: float | Float[Array, ""] = 0.3  # share of the speed lost on wet rail, 1
-    ess_share: float = 0.5  # the cloud is resampled when its effective size falls below this share
+    slip_loss: float | Float[Array, ""] = 0.3  # fraction of the speed lost on wet rail, 1
+    ess_share: float = 0.5  # the cloud is resampled when its effective size falls below this fraction
     # Share to which one scan may reduce the effective size. A likelihood that would reduce it further is flattened, so
     # that chance does not select a few particles of a sparse cloud.
     least_share: float = 0.5

@@ -33,7 +33,7 @@ class ExactParams:
     # what a metre of range adds to that, 1: the tangent follows from the curvature about the robot
     bend_sigma: float = 0.001
     power: float = 0.5  # exponent of the likelihood: scans have errors in common
-    # share of the echoes that are lost or false, where there are faults or boxes; elsewhere a tenth of it
+    # fraction of the echoes that are lost or false, where there are faults or boxes; elsewhere a tenth of it
     lost: float = 0.2
 
 

@@ -156,7 +156,7 @@ class HistogramLocaliser(Localiser):
     def _memory(
         self, log_mass: Float[Array, "ways n"], origin: Float[Array, ""], obs: Observed, params: EnvParams
     ) -> HistogramMemory:
-        """Returns the memory of a belief over cells: each row of errors has its share of the mass."""
+        """Returns the memory of a belief over cells: each row of errors has its fraction of the mass."""
         sigma = jnp.hypot(self.noise.scale_sigma, self.noise.wander.sigma)
         rows = -0.5 * (jnp.asarray(_scales()) / jnp.maximum(sigma, 1e-6)) ** 2
         ways = log_mass.shape[0]
@@ -182,7 +182,7 @@ class HistogramLocaliser(Localiser):
         return jnp.cos(turned)
 
     def _slide(self, mass: Float[Array, "ways n_scales n"], along: Float[Array, ""]) -> Float[Array, "ways n_scales n"]:
-        """Slides each row of errors by its share of a step, and spreads what the step adds to errors and way."""
+        """Slides each row of errors by its fraction of a step, and spreads what the step adds to errors and way."""
         noise, size = self.noise, jnp.abs(along)
         change = 2.0 * noise.wander.sigma**2 / noise.wander.length * size / (_scales()[1] - _scales()[0]) ** 2
         mass = _diffused(mass, jnp.minimum(change, 0.5), axis=1)

@@ -41,7 +41,7 @@ class MatchParams:
     lateral_sigma: float = 0.01  # standard deviation of the offset after one step of dead reckoning, m
     heading_sigma: float = 0.003  # standard deviation of the heading, rad
     bend_sigma: float = 0.0002  # standard deviation of the curvature of the axis, 1/m
-    width_gain: float = 0.05  # share of a change of width that one scan contributes, 1
+    width_gain: float = 0.05  # fraction of a change of width that one scan contributes, 1
     least_age: float = 1.0  # least distance to the station from which an entry was seen for it to be matched, m
     least_information: float = 5000.0  # curvature of the cost below which a match is not used, 1/m²
 

@@ -26,9 +26,9 @@ class ScanModel:
     # standard deviation of the mapped walls, m, for a beam square to them; a slanting beam meets more of what the map
     # leaves out, such as the far end of a pocket instead of its back
     map_sigma: float = 0.01
-    outlier_share: float = 0.05  # share of the beams that meet something outside the map: dust, a box
+    outlier_share: float = 0.05  # fraction of the beams that meet something outside the map: dust, a box
     outlier_density: float = 0.1  # density of the residuals of such beams, 1/m
-    miss_share: float = 0.02  # share of the beams that get no echo from a near wall
+    miss_share: float = 0.02  # fraction of the beams that get no echo from a near wall
     # Longest range used, m: longer beams graze the wall. The same beams are used for every pose, or poses would be
     # compared by how many beams they leave out.
     reach: float = 9.0

@@ -51,7 +51,7 @@ def within(tolerance: float, sigma: Float[np.ndarray, " n"]) -> float:
 def is_above(success: float, bound: float, n: int, n_bound: int = 0) -> bool:
     """Tell whether a share of `n` episodes is above a bound by four standard errors: a table has some hundred shares.
 
-    The bound is exact, or itself a share of `n_bound` episodes.
+    The bound is exact, or itself a fraction of `n_bound` episodes.
     """
     variance = max(bound * (1.0 - bound), 0.25 / n) * (1.0 / n + (1.0 / n_bound if n_bound else 0.0))
     return success - bound > 4.0 * math.sqrt(variance)
@@ -123,7 +123,7 @@ class _Errors:
 def _on_wet_rail(
     distance: Float[np.ndarray, " n"], sigma: Float[np.ndarray, " n"], tolerance: float, params: EnvParams
 ) -> float:
-    """Success of the best distance to command, over severities, wet shares, losses and places of wet patches.
+    """Success of the best distance to command, over severities, wet fractions, losses and places of wet patches.
 
     Nothing but the walls tells wet rail, so the best is one distance for each goal and severity.
     """
@@ -143,7 +143,7 @@ def _on_wet_rail(
 
 
 def _best_share(needed: Float[np.ndarray, " n"], reach: Float[np.ndarray, " n"]) -> float:
-    """Return the largest share of intervals `needed ± reach` that hold one and the same point."""
+    """Return the largest fraction of intervals `needed ± reach` that hold one and the same point."""
     ends = np.concatenate([needed - reach, needed + reach])
     change = np.concatenate([np.ones(len(needed)), -np.ones(len(needed))])
     return float(np.max(np.cumsum(change[np.argsort(ends, kind="stable")])) / len(needed))

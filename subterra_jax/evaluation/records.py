@@ -35,7 +35,7 @@ class Records:
         group: Stratum of the bootstrap.
         success: Whether the task was achieved.
         contact: Whether it ended at a wall or an obstacle.
-        coverage: Share of the tunnel covered, as the paper counts it: the episode ends at the goal's share.
+        coverage: Fraction of the tunnel covered, as the paper counts it: the episode ends at the goal's fraction.
         progress: The same, had the agent gone on to the far mouth: not cut off at success.
         spl: Success weighted by path length, 0 to 1.
         travelled: Distance driven, m.
@@ -227,7 +227,7 @@ class Tally:
     contact: Bool[Array, ""]  # it ended at a wall or an obstacle
     # where it stood less where it should have (of what it reported less where it stood), m
     goal_error: Float[Array, ""]
-    coverage: Float[Array, ""]  # share of the tunnel covered when the episode was over
+    coverage: Float[Array, ""]  # fraction of the tunnel covered when the episode was over
     progress: Float[Array, ""]  # share covered had the robot gone on to the far mouth
     over: Bool[Array, ""]  # the episode is over as published; what comes after only counts as progress
     estimates: EstimateTally  # scores of its estimate

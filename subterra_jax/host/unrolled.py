@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-BAND = 0.6  # share of the spacing around within which no grid point is near a rim or a corner of the section
+BAND = 0.6  # fraction of the spacing around within which no grid point is near a rim or a corner of the section
 _CORNER = np.radians(30.0)  # a section that turns more than this over four of its angles has a corner there
 _PAD = 1.0  # of the sheet, repeated beyond the seam, m
 _LID = 0.05  # of a recess's box inside the bore, so that a union leaves no film, m

@@ -18,15 +18,15 @@ ALBEDO_LINING, ALBEDO_FLOOR, ALBEDO_THING = 0.30, 0.20, 0.36
 
 @struct.dataclass
 class EchoParams:
-    """Errors of one model of LiDAR. Source of the noise: facts/geode.md has 2 cm for the Avia; the shares are ours.
+    """Errors of one model of LiDAR. Source of the noise: facts/geode.md has 2 cm for the Avia; the fractions are ours.
 
     Attributes:
         sigma: Standard deviation of a range met squarely and near, m.
         sigma_per_metre: Standard deviation that each metre of range adds in quadrature, m/m.
         sigma_slant: Standard deviation added in quadrature for each unit of the tangent of incidence, up to 10, m.
-        lost: Share of returns that are lost for no other reason.
+        lost: Fraction of returns that are lost for no other reason.
         weakest: Weakest echo that is detected: reflectivity · cosine of incidence / distance², 1/m².
-        mixed: Share of the beams across a depth edge whose return falls between its two surfaces.
+        mixed: Fraction of the beams across a depth edge whose return falls between its two surfaces.
         divergence: Half the opening angle of a beam, rad.
         losing: Lose returns, by `lost` and `weakest`.
         mixing: Mix pixels, at the price of a second ray for each beam.

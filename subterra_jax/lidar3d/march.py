@@ -121,7 +121,7 @@ def _leap(tools: Tools, frame: Any, at: list[Array], d: list[Array]) -> Float[Ar
 
 
 def wedge_edge(turn: Float[Array, "n"]) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
-    """Return the direction left and up at a share of 4 of a turn, as `cells.wedge_edge`."""
+    """Return the direction left and up at a fraction of 4 of a turn, as `cells.wedge_edge`."""
     return jnp.abs(turn - 2.0) - 1.0, jnp.abs(turn + jnp.where(turn < 1.0, 1.0, -3.0)) - 1.0
 
 

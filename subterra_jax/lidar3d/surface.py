@@ -40,7 +40,7 @@ def join_surfaces(parts: list[Triangles]) -> Triangles:
 
 
 _OFF = 2e-5  # m, by which a corner may be off its box: a tunnel's file has whole units
-_FLAT = 1e-3  # least volume of a box, as a share of what its edges would have if they were square to one another
+_FLAT = 1e-3  # least volume of a box, as a fraction of what its edges would have if they were square to one another
 
 
 @dataclasses.dataclass(frozen=True)

@@ -23,7 +23,7 @@ compiled = njit(error_model="numpy", fastmath={"contract"}, forceinline=True)
 @compiled
 @no_type_check
 def _edge(turn):
-    """Return the direction left and up at a share of 4 of a turn, as `march.wedge_edge`."""
+    """Return the direction left and up at a fraction of 4 of a turn, as `march.wedge_edge`."""
     return abs(turn - _F(2.0)) - _ONE, abs(turn + (_ONE if turn < _ONE else _F(-3.0))) - _ONE
 
 

@@ -36,14 +36,14 @@ class FaultParams:
         severity_low: Least severity of an episode, 0 to 4.
         severity_high: Largest severity; the whole numbers in between are equally likely.
         dropout_rate: Probability per step that a sector of beams drops out for a while.
-        dropout_share: Largest share of the beams that drop out together.
+        dropout_share: Largest fraction of the beams that drop out together.
         dropout_steps: Longest drop-out, steps.
         dust_rate: Probability that a beam is reflected by dust before it meets the wall.
         freeze_rate: Probability per step that the odometer stops counting for a while.
         freeze_steps: Longest freeze, steps.
         delay: Age of the observation, steps; at most 4.
-        wet_share: Share of the 10 m patches of rail that are wet.
-        wet_loss: Share of the speed lost on wet rail, while the wheels turn as before.
+        wet_share: Fraction of the 10 m patches of rail that are wet.
+        wet_loss: Fraction of the speed lost on wet rail, while the wheels turn as before.
         spread: Each of `SIZES` is drawn evenly between 1 - spread and 1 + spread times its middle, by itself.
         origin_distance: Standard deviation of the odometer's distance at the start, m.
         origin_heading: Standard deviation of its heading there, rad.

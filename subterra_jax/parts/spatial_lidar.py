@@ -171,7 +171,7 @@ class Sweeping:
 def along_arc(
     start: Sweeping, position: Float[Array, "2"], heading: Float[Array, ""], share: Float[Array, "n"]
 ) -> tuple[Float[Array, "n 2"], Float[Array, "n"]]:
-    """Return poses (m, rad) at shares of the way from one pose to another, by a constant speed and yaw rate."""
+    """Return poses (m, rad) at fractions of the way from one pose to another, by a constant speed and yaw rate."""
     turn = wrap(heading - start.heading)
     chord_x, chord_y = position[0] - start.position[0], position[1] - start.position[1]
     small = jnp.abs(turn) < 1e-3

@@ -34,7 +34,7 @@ class Layout:
     shape: Shape  # sizes of the network
     action_low: tuple[float, ...]  # smallest action, m/s and rad/s
     action_high: tuple[float, ...]  # largest action, m/s and rad/s
-    standing: float = 0.5  # share of the largest speed by which the range of the tanh goes below 0
+    standing: float = 0.5  # fraction of the largest speed by which the range of the tanh goes below 0
 
     def to_json(self) -> dict[str, Any]:
         return dataclasses.asdict(self)

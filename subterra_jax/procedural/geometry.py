@@ -21,7 +21,7 @@ class LineRanges:
     arc: Range  # length of constant curvature, m
     transition: Range  # length of each clothoid, over which the curvature changes evenly, m
     turn: float  # largest turn of one bend, without its clothoids, rad
-    reverse_share: float = 0.3  # share of bends followed by the opposite bend without a straight
+    reverse_share: float = 0.3  # fraction of bends followed by the opposite bend without a straight
     grid_step: float = 0.25  # step of the station grid, m
 
 

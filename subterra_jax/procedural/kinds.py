@@ -52,7 +52,7 @@ class RingRanges:
     step_sd: Range  # standard deviation of the radial place of one segment, m; neighbours step by 1.4 times as much
     oval: Range  # excess of the horizontal over the mean radius, 1
     turned: bool  # true for universal rings: each ring is turned to the place of its key segment
-    dowel_share: float  # share of tunnels whose ring joints have dowels, which leave no pockets
+    dowel_share: float  # fraction of tunnels whose ring joints have dowels, which leave no pockets
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,8 +64,8 @@ class PocketRanges:
     width: Range  # width around the section, m
     depth: Range  # depth, m
     offset: Range  # distance of the middle from its joint, m
-    missing: Range  # share of pockets that are missing or grouted flush
-    grouted_share: float  # share of tunnels in which nearly all (95 %) are grouted
+    missing: Range  # fraction of pockets that are missing or grouted flush
+    grouted_share: float  # fraction of tunnels in which nearly all (95 %) are grouted
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,7 +77,7 @@ class StretchRanges:
     offset_sd: Range  # standard deviation of a stretch's radial place, m, the same all around
     shift_sd: Range  # standard deviation of its place aside and upright, m
     flare: Range = (0.0, 0.0)  # growth of the radius from the begin of a stretch to its end, m
-    repaired: Range = (0.0, 0.0)  # share of stretches with a ring of repair inside the wall
+    repaired: Range = (0.0, 0.0)  # fraction of stretches with a ring of repair inside the wall
     thickness: Range = (0.0, 0.0)  # thickness of such a ring, m
 
 
@@ -117,7 +117,7 @@ _BOLTS = PocketRanges(
     depth=(0.08, 0.15),  # C, M
     offset=(0.21, 0.28),  # C
     missing=(0.0, 0.3),  # M
-    grouted_share=0.15,  # B says that it happens; the share is ours
+    grouted_share=0.15,  # B says that it happens; the fraction is ours
 )
 _STRAIGHT = RingRanges(
     nominal=(1.0, 2.0),  # A, B
@@ -151,7 +151,7 @@ KINDS: dict[str, Kind] = {
             _METRO,
             _CONCRETE,
             0.125,
-            # Dowels instead of bolts in ring joints are common with universal rings (M); the share is ours.
+            # Dowels instead of bolts in ring joints are common with universal rings (M); the fraction is ours.
             rings=dataclasses.replace(_STRAIGHT, turned=True, dowel_share=0.5),
             pockets=_BOLTS,
             fixtures=_METRO_FIXTURES,

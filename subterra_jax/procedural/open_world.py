@@ -41,7 +41,7 @@ UNSEEN = "test-unseen"
 _FAMILY = 19  # tells the seeds of this family from those of others
 _STREAMS = ("line", "section", "surface", "pocket", "furniture", "mount", "grade", "items")
 _NAME = re.compile(r"open:(?:([a-z]+):)?([a-z-]+):(\d+)")
-_HALF = 0.5  # share of the furniture of a kind that a tunnel with `some` has
+_HALF = 0.5  # fraction of the furniture of a kind that a tunnel with `some` has
 _ROOM = 1.0  # m to either side over which the narrowest place counts as the half width
 
 # Radii of main lines and metros; from memory, not looked up.

@@ -30,7 +30,7 @@ class Trace:
     # none), log of its standard deviation, direction
     action: Float[np.ndarray, "n 5"]
     reward: Float[np.ndarray, "n"]  # reward of the step that led to row k + 1
-    coverage: Float[np.ndarray, "n"]  # share of the tunnel covered by then
+    coverage: Float[np.ndarray, "n"]  # fraction of the tunnel covered by then
     # some of the agent's particles: station and lateral offset, m, and weight over the mean weight; `p` is 0 without a
     # particle filter
     cloud: Float[np.ndarray, "rows p 3"]

@@ -109,7 +109,7 @@ class GoalRule(Rule):
         )
 
     def privileged(self, state: State) -> dict[str, Array]:
-        """Return the way to the goal, m, and how long the robot has stood, as a share of a stop."""
+        """Return the way to the goal, m, and how long the robot has stood, as a fraction of a stop."""
         return {"to_goal": state.goal.station - state.station, "still": state.goal.still}
 
     def tolerance(self, params: EnvParams) -> Any:

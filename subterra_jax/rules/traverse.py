@@ -20,7 +20,7 @@ class RewardParams:
 
     Attributes:
         terminal: Reward of success, once.
-        coverage: g, reward of the share of the tunnel newly covered.
+        coverage: g, reward of the fraction of the tunnel newly covered.
         lateral: c_d, cost of the distance from the centreline over the half-width.
         jerk: c_s, cost of the change of command, m/s and rad/s alike.
     """

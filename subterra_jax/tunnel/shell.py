@@ -72,7 +72,7 @@ def make_bricks(
         centre: Middles, m.
         heading: Heading of the long edge in the tunnel frame, rad.
         half: Halves of the edges: along the heading, to the left, upwards, m.
-        taper: Share by which the length is less at the top than in the middle, and more at the foot; 0 for a box.
+        taper: Fraction by which the length is less at the top than in the middle, and more at the foot; 0 for a box.
     """
     cos, sin, zero = np.cos(heading), np.sin(heading), np.zeros(len(centre))
     along, left = np.stack([cos, sin, zero], axis=-1), np.stack([-sin, cos, zero], axis=-1)

@@ -120,7 +120,7 @@ class _Player:
             self._status.text = _status(drawn, row)
 
     def move(self, row: int, share: float) -> None:
-        """Move the tunnel past the robot, to a share of the way to the next row."""
+        """Move the tunnel past the robot, to a fraction of the way to the next row."""
         position, heading = self._drawn.pose(row + share)
         back = Rotation.from_euler("z", -heading)
         self._world.position, self._world.wxyz = -back.apply(position), _about_z(-heading)

@@ -209,7 +209,7 @@ def score(records: dict[str, np.ndarray], period: float) -> dict[str, float]:
     Returns:
         `falls` (share of the robots that fell before the episode's end), `velocity_error` (m/s, mean distance in plan
         between velocity and command), `yaw_rate_error` (rad/s, mean absolute), both averaged over a stride of 0.4 s
-        against the slewed command and from 1 s after the start, `contacts` (share of robots that touched a wall),
+        against the slewed command and from 1 s after the start, `contacts` (fraction of robots that touched a wall),
         `power` (W, mean mechanical), and `robots`.
     """
     alive = ~records["over"]

@@ -27,7 +27,7 @@ from benchmarks.fidelity.table import B, D, U, metric
 _FEWEST_FEATURES = 10  # features that show a drift
 _NO_VARIATION = 1e-3  # m; a section that varies by less is constant
 _NO_GRID = 100.0  # %; error of a lining without any grid
-_UNKNOWN_PHASE = 0.25  # share of a pitch; mean error of an unknown phase
+_UNKNOWN_PHASE = 0.25  # fraction of a pitch; mean error of an unknown phase
 _NO_POCKETS = "the reference shows no pockets"
 _NO_MATCH = "no pocket of the candidate lies where the reference has one"
 _POCKET_NEIGHBOURS = (0.10, 0.80)  # m of station between pockets that a nail joins
@@ -275,7 +275,7 @@ def lin_circ_pitch_err(case: Case) -> Value:
 
 @metric("lin_ring_phase_err", "LIN", D(1e-06, 0.25), needs="reference", of=mean)
 def lin_ring_phase_err(case: Case) -> Value | Samples:
-    """Mean absolute error of the grid's phase in windows of four pitches, share of a pitch."""
+    """Mean absolute error of the grid's phase in windows of four pitches, fraction of a pitch."""
     length = lining.reference_pitch(case)
     if length is None:
         return missing(_NO_POCKETS)

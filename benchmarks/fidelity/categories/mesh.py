@@ -49,7 +49,7 @@ def mesh_winding_consistent(case: Case) -> Value:
 
 @metric("mesh_orientation_frac", "MSH", U(0.98, 0.999), gate=True)
 def mesh_orientation_frac(case: Case) -> Value:
-    """Share of the lining's area whose normal looks at the axis; each ray stands for the area that it sees."""
+    """Fraction of the lining's area whose normal looks at the axis; each ray stands for the area that it sees."""
     hits = derived.axis_hits(case)
     met = np.isfinite(hits.distance)
     area = hits.distance[met] ** 2 / np.maximum(np.abs(hits.cosine[met]), _GRAZING)
@@ -100,14 +100,14 @@ def mesh_boundary_unexpected(case: Case) -> Value:
 
 @metric("mesh_nonmanifold_edges", "MSH", D(0, 0.001))
 def mesh_nonmanifold_edges(case: Case) -> Value:
-    """Share of edges with more than two faces; the worse of lining and solid."""
+    """Fraction of edges with more than two faces; the worse of lining and solid."""
     both = derived.lining_edges(case), derived.mesh_edges(derived.welded_solid(case))
     return number(max(float(np.mean(edges.faces > 2)) for edges in both), sum(len(edges.faces) for edges in both))
 
 
 @metric("mesh_duplicate_faces", "MSH", D(0, 0.001))
 def mesh_duplicate_faces(case: Case) -> Value:
-    """Share of faces that another face repeats, whichever way round; the worse of lining and solid."""
+    """Fraction of faces that another face repeats, whichever way round; the worse of lining and solid."""
     both = derived.welded_lining(case), derived.welded_solid(case)
     shares = [1.0 - len(np.unique(np.sort(mesh.faces, axis=1), axis=0)) / len(mesh.faces) for mesh in both]
     return number(max(shares), sum(len(mesh.faces) for mesh in both))
@@ -115,7 +115,7 @@ def mesh_duplicate_faces(case: Case) -> Value:
 
 @metric("mesh_degenerate_faces", "MSH", D(0, 0.001))
 def mesh_degenerate_faces(case: Case) -> Value:
-    """Share of faces lower than a thousandth of a millimetre; the worse of lining and solid."""
+    """Fraction of faces lower than a thousandth of a millimetre; the worse of lining and solid."""
     both = derived.welded_lining(case), derived.welded_solid(case)
     thin = [2.0 * mesh.area_faces / np.maximum(_side_lengths(mesh).max(axis=1), 1e-12) < _THIN for mesh in both]
     return number(max(float(np.mean(one)) for one in thin), sum(len(mesh.faces) for mesh in both))
@@ -127,7 +127,7 @@ def _side_lengths(mesh: trimesh.Trimesh) -> Float[np.ndarray, "f 3"]:
 
 @metric("mesh_self_intersections", "MSH", D(0, 0.005))
 def mesh_self_intersections(case: Case) -> Value:
-    """Share of the lining's faces that cut another one in every pose of the mesh.
+    """Fraction of the lining's faces that cut another one in every pose of the mesh.
 
     Faces that lie in one plane and share a corner may seem to cut each other by rounding, in one pose but not in all.
     """
@@ -180,7 +180,7 @@ def tri_min_angle_p05(case: Case) -> Value:
 
 @metric("tri_sliver_frac", "TRI", D(0.001, 0.015))
 def tri_sliver_frac(case: Case) -> Value:
-    """Share of triangles with an angle below 1 degree."""
+    """Fraction of triangles with an angle below 1 degree."""
     angle = _least_angles(derived.welded_lining(case))
     return number(float(np.mean(angle < 1.0)), len(angle))
 
@@ -308,7 +308,7 @@ def topo_free_b0(case: Case) -> Value:
 
 @metric("topo_leak_frac", "TOP", D(0.0001, 0.01), gate=True)
 def topo_leak_frac(case: Case) -> Value:
-    """Share of rays from the axis that meet no lining and leave by neither mouth."""
+    """Fraction of rays from the axis that meet no lining and leave by neither mouth."""
     hits = derived.axis_hits(case)
     missed = np.flatnonzero(~np.isfinite(hits.distance))
     leaves = np.zeros(len(missed), bool)
@@ -352,7 +352,7 @@ def bottleneck_distance(case: Case, dimension: int) -> Value:
 
 @metric("topo_floater_area", "TOP", D(0, 0.01))
 def topo_floater_area(case: Case) -> Value:
-    """Share of the area of lining and extra surfaces that is not in the lining's largest piece."""
+    """Fraction of the area of lining and extra surfaces that is not in the lining's largest piece."""
     mesh, extra = derived.welded_lining(case), case.candidate.extra
     area = np.bincount(derived.face_parts(mesh), weights=mesh.area_faces)
     whole = area.sum() + (extra.area if len(extra.faces) else 0.0)

@@ -73,7 +73,7 @@ def spacing_error(case: Case, statistic: Statistic) -> Value:
 
 @metric("trk_sleeper_in_bore", "TRK", U(0.98, 1))
 def trk_sleeper_in_bore(case: Case) -> Value:
-    """Share of sleepers whose top keeps 2 cm from the wall of the local section."""
+    """Fraction of sleepers whose top keeps 2 cm from the wall of the local section."""
     if not len(case.candidate.track.sleeper):
         return missing(_NO_TRACK)
     fits = track.sleepers_fit(case, _BORE_MARGIN)
@@ -211,7 +211,7 @@ def _push_robot(case: Case) -> tuple[np.ndarray, int, float]:
 
 @metric("mj_probe_free_frac", "SCN", U(0.99, 1), gate=True)
 def mj_probe_free_frac(case: Case) -> Value:
-    """Share of axis stations where a sphere of 0.3 m touches nothing."""
+    """Fraction of axis stations where a sphere of 0.3 m touches nothing."""
     free = contact.probe_free(case)
     return number(free.mean(), len(free))
 
@@ -238,7 +238,7 @@ def mj_ray_vs_mesh_mae(case: Case) -> Value:
 
 @metric("mj_ray_leak_rate", "SCN", D(1e-05, 0.001))
 def mj_ray_leak_rate(case: Case) -> Value:
-    """Share of rays that meet the meshes and nothing in the scene."""
+    """Fraction of rays that meet the meshes and nothing in the scene."""
     scene, mesh, _ = rays_from_axis(case)
     due = np.isfinite(mesh)
     return number(np.mean(~np.isfinite(scene[due])), int(due.sum()))
@@ -333,7 +333,7 @@ def mjx_ray_parity(case: Case) -> Value:
 
 @metric("mjx_contact_parity", "PAR", U(0.95, 1))
 def mjx_contact_parity(case: Case) -> Value:
-    """Share of 200 placements of the robot with the same contact decision and a depth within 1 mm."""
+    """Fraction of 200 placements of the robot with the same contact decision and a depth within 1 mm."""
     ours, theirs = contact.contact_depths(case)
     same = ((ours < 0.0) == (theirs < 0.0)) & (np.abs(ours - theirs) <= _SAME_DEPTH)
     return number(same.mean(), len(same), f"{np.mean(ours < 0.0):.0%} of them in contact")

@@ -58,26 +58,26 @@ def beam_range_bias(case: Case) -> Samples:
 
 @metric("beam_rel_medae", "BEA", D(0.298, 1.3), "%", needs="hold", of=np.median)
 def beam_rel_medae(case: Case) -> Samples:
-    """Median absolute range difference as a share of the range, %."""
+    """Median absolute range difference as a fraction of the range, %."""
     error, station = _range_error(case)
     return Samples(100.0 * np.abs(error) / returns(case).range[cast_beams(case).hit], station, BOOTSTRAP_SAMPLES)
 
 
 @metric("beam_within_10cm", "BEA", U(0.85, 0.999754), needs="hold", of=np.mean)
 def beam_within_10cm(case: Case) -> Samples:
-    """Share of the returns that the candidate gives within 10 cm; a beam that leaves it is not within."""
+    """Fraction of the returns that the candidate gives within 10 cm; a beam that leaves it is not within."""
     return _beam_share(case, np.abs(cast_beams(case).difference) <= 0.10)
 
 
 @metric("beam_early_frac", "BEA", D(6.93e-05, 0.03), needs="hold", of=np.mean)
 def beam_early_frac(case: Case) -> Samples:
-    """Share of the returns in front of which, by more than 20 cm, the candidate stands."""
+    """Fraction of the returns in front of which, by more than 20 cm, the candidate stands."""
     return _beam_share(case, cast_beams(case).difference < -_FAR)
 
 
 @metric("beam_late_frac", "BEA", D(7.94e-05, 0.05), needs="hold", of=np.mean)
 def beam_late_frac(case: Case) -> Samples:
-    """Share of the returns that the candidate gives more than 20 cm later, or not at all."""
+    """Fraction of the returns that the candidate gives more than 20 cm later, or not at all."""
     return _beam_share(case, cast_beams(case).difference > _FAR)
 
 
@@ -105,7 +105,7 @@ def selfcast_p2s_mean(case: Case) -> Value:
 
 @metric("selfcast_within_10cm", "BEA", LOGGED_UP, needs="hold", evidence="C")
 def selfcast_within_10cm(case: Case) -> Value:
-    """The paper's headline: share of that cloud within 10 cm."""
+    """The paper's headline: fraction of that cloud within 10 cm."""
     near = self_cast(case)[0] <= 0.10
     return number(float(np.mean(near)), len(near), _CIRCULAR)
 
@@ -192,7 +192,7 @@ def incidence_w1(case: Case) -> Value:
 
 @metric("dropout_diff", "DIS", D(0.00356, 0.1), needs="hold")
 def dropout_diff(case: Case) -> Value:
-    """Difference between the shares of beams without a return."""
+    """Difference between the fractions of beams without a return."""
     assert case.hold is not None
     if not case.hold.knows_missing:
         return missing(_NO_SILENCE)
@@ -350,5 +350,5 @@ def deg_icp_axial_logratio(case: Case) -> Value:
 
 @metric("deg_planar_axial_info", "DEG")
 def deg_planar_axial_info(case: Case) -> Value:
-    """Share of stations at which the environment's planar scan alone fixes the station."""
+    """Fraction of stations at which the environment's planar scan alone fixes the station."""
     return number(float(np.mean(degeneracy.localised_stations(case))), len(degeneracy.localised_stations(case)))

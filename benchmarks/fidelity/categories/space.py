@@ -35,7 +35,7 @@ _NO_REFERENCE = "the reference shows no way from mouth to mouth"
 
 
 def _agreement(case: Case, among: np.ndarray, both: np.ndarray) -> Samples:
-    """Share of the cells `among` that are free in `both`, where the reference is known."""
+    """Fraction of the cells `among` that are free in `both`, where the reference is known."""
     picked = among & plane.free_plane(case).known
     station = np.broadcast_to(plane.free_plane(case).station[:, None], picked.shape)[picked]
     return Samples(both[picked].astype(float), station)
@@ -50,13 +50,13 @@ def occ2d_free_iou(case: Case) -> Samples:
 
 @metric("occ2d_free_precision", "F2D", U(0.9, 0.999462), needs="reference", of=mean)
 def occ2d_free_precision(case: Case) -> Samples:
-    """Share of the candidate's free cells that are free in the reference."""
+    """Fraction of the candidate's free cells that are free in the reference."""
     return _agreement(case, plane.free_plane(case).judged, plane.free_plane(case).reference)
 
 
 @metric("occ2d_free_recall", "F2D", U(0.9, 0.99678), needs="reference", of=mean)
 def occ2d_free_recall(case: Case) -> Samples:
-    """Share of the reference's free cells that are free in the candidate."""
+    """Fraction of the reference's free cells that are free in the candidate."""
     return _agreement(case, plane.free_plane(case).reference, plane.free_plane(case).judged)
 
 
@@ -120,7 +120,7 @@ def free2d_skeleton_p95(case: Case) -> Value:
 
 @metric("occ2d_unknown_frac", "F2D", needs="hold")
 def occ2d_unknown_frac(case: Case) -> Value:
-    """Share of the candidate's free cells that no held-out beam shows."""
+    """Fraction of the candidate's free cells that no held-out beam shows."""
     return number(plane.unknown_share(case), int(plane.free_plane(case).judged.sum()))
 
 
@@ -146,7 +146,7 @@ def free3d_volume_rel_err(case: Case) -> Value:
 
 @metric("free3d_false_free", "F3D", D(1e-06, 0.05), needs="hold", of=mean)
 def free3d_false_free(case: Case) -> Samples:
-    """Share of held-out returns deeper than 20 cm in the candidate's air."""
+    """Fraction of held-out returns deeper than 20 cm in the candidate's air."""
     points, deep = hold_points(case), _DEEP_RETURN
     inside = lining_radii(case).depth(points) > deep
     wrong = np.zeros(len(points))
@@ -157,7 +157,7 @@ def free3d_false_free(case: Case) -> Samples:
 
 @metric("free3d_false_occupied", "F3D", D(1e-06, 0.05), needs="hold", of=mean)
 def free3d_false_occupied(case: Case) -> Samples:
-    """Share of the length of held-out beams, up to 20 cm before their returns, that the candidate holds occupied.
+    """Fraction of the length of held-out beams, up to 20 cm before their returns, that the candidate holds occupied.
 
     Occupied is whatever lies 5 cm outside its lining, and what its extra surfaces fill or close off.
     """
@@ -195,7 +195,7 @@ def free3d_headroom_rmse(case: Case) -> Samples:
 
 @metric("free3d_envelope_agree", "F3D", U(0.9, 0.999999), needs="reference", of=mean)
 def free3d_envelope_agree(case: Case) -> Samples:
-    """Share of sections and envelopes in which lining and reference agree whether the envelope is cut into."""
+    """Fraction of sections and envelopes in which lining and reference agree whether the envelope is cut into."""
     judged, reference = freespace.infringements(case)
     return Samples((judged == reference).mean(axis=1), sections(case).station)
 
@@ -280,7 +280,7 @@ def nav_drivable_width_mae(case: Case) -> Samples:
 
 @metric("nav_feasible_agree", "NAV", U(0.9, 0.999999), needs="reference")
 def nav_feasible_agree(case: Case) -> Value:
-    """Share of 1,000 random starts, goals and inflations that are feasible on both grounds or on neither.
+    """Fraction of 1,000 random starts, goals and inflations that are feasible on both grounds or on neither.
 
     The mean over ten lattices of cells, with 1,000 in each.
     """

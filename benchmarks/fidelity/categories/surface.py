@@ -47,7 +47,7 @@ def mesh_distance(case: Case) -> Samples:
 @metric("c2m_within_5cm", "C2M", U(0.83, 0.99776), needs="hold", of=np.mean, args=(0.05,))
 @metric("c2m_within_10cm", "C2M", U(0.949, 0.999999), needs="hold", of=np.mean, args=(0.10,))
 def mesh_precision(case: Case, within: float) -> Samples:
-    """Share of held-out points within a distance of the surface; at 10 cm the paper's figure on unseen points."""
+    """Fraction of held-out points within a distance of the surface; at 10 cm the paper's figure on unseen points."""
     near = mesh_distances(case).distance <= within
     return Samples(near.astype(float), mesh_distances(case).station, BOOTSTRAP_SAMPLES)
 
@@ -95,7 +95,7 @@ def c2m_fit_hold_gap(case: Case) -> Value:
 
 @metric("m3c2_signif_frac", "C2M", D(1e-06, 0.5), needs="hold", of=np.mean)
 def m3c2_signif_frac(case: Case) -> Samples:
-    """Share of core points whose M3C2 distance exceeds its level of detection."""
+    """Fraction of core points whose M3C2 distance exceeds its level of detection."""
     distances = m3c2_distances(case)
     return Samples(distances.significant, distances.station, BOOTSTRAP_SAMPLES)
 
@@ -110,7 +110,7 @@ def _completeness(case: Case, within: float) -> np.ndarray:
 @metric("comp_10cm", "CMP", U(0.86, 0.999836), needs="hold", of=np.mean, args=(0.10,))
 @metric("comp_20cm", "CMP", LOGGED_UP, needs="hold", of=np.mean, args=(0.20,))
 def completeness(case: Case, within: float) -> Samples:
-    """Share of the observed surface with a held-out point within a distance."""
+    """Fraction of the observed surface with a held-out point within a distance."""
     return Samples(_completeness(case, within), cloud_distances(case)[1], BOOTSTRAP_SAMPLES)
 
 
@@ -157,13 +157,13 @@ def comp_chainage_min(case: Case) -> Value:
 
 @metric("extra_surface_frac", "CMP", D(6.32e-05, 0.05), gate=True, needs="hold")
 def extra_surface_frac(case: Case) -> Value:
-    """Share of the observable surface through which held-out beams passed."""
+    """Fraction of the observable surface through which held-out beams passed."""
     return number(float(np.mean(phantom_cells(case))), len(phantom_cells(case)))
 
 
 @metric("missing_surface_frac", "CMP", D(1e-06, 0.1), needs="hold", of=np.mean)
 def missing_surface_frac(case: Case) -> Samples:
-    """Share of held-out points with no surface within 20 cm."""
+    """Fraction of held-out points with no surface within 20 cm."""
     far = mesh_distances(case).distance > _FAR
     return Samples(far.astype(float), mesh_distances(case).station, BOOTSTRAP_SAMPLES)
 
@@ -188,7 +188,7 @@ def vox_iou_norm(case: Case) -> Value:
 @metric("vox_precision", "OCC", U(0.951, 0.99356), needs="hold", args=(1,))
 @metric("vox_recall", "OCC", U(0.967, 0.999867), needs="hold", args=(0,))
 def voxel_share(case: Case, side: int) -> Value:
-    """Share of the voxels of one side (1 the candidate, 0 the held-out cloud) that the other has too."""
+    """Fraction of the voxels of one side (1 the candidate, 0 the held-out cloud) that the other has too."""
     both = both_apart(*occupied_voxels(case).points[:2])
     own = both[side].sum()
     return number(float((both[0] & both[1]).sum() / max(own, 1)), int(own))
@@ -213,7 +213,7 @@ def vox_kappa(case: Case) -> Value:
 
 @metric("vox_interior_mismatch", "OCC", D(1e-06, 0.25), needs="hold")
 def vox_interior_mismatch(case: Case) -> Value:
-    """Share of mismatches farther than one voxel from the other surface and over 2 m from a mouth."""
+    """Fraction of mismatches farther than one voxel from the other surface and over 2 m from a mouth."""
     grids = occupied_voxels(case)
     far = (grids.real & ~dilate(grids.first)) | (grids.first & ~dilate(grids.real))
     far &= ~_mouth_slices(case)[:, None, None]
@@ -223,7 +223,7 @@ def vox_interior_mismatch(case: Case) -> Value:
 
 @metric("vox_mouth_mismatch", "OCC", needs="hold")
 def vox_mouth_mismatch(case: Case) -> Value:
-    """Share of mismatches within 2 m of a mouth."""
+    """Fraction of mismatches within 2 m of a mouth."""
     grids = occupied_voxels(case)
     mismatch = grids.real ^ grids.first
     return number(float(mismatch[_mouth_slices(case)].sum() / max(mismatch.sum(), 1)), int(mismatch.sum()))

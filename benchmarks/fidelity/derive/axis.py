@@ -19,7 +19,7 @@ _AXIS_SMOOTH = 3.0  # m
 _SEED_CALM = 8.0  # m
 _ROUNDS = 3
 _MOST_POINTS = 400_000
-_KNOWN_SHARE = 0.6  # share of the sectors that makes a slice count
+_KNOWN_SHARE = 0.6  # fraction of the sectors that makes a slice count
 
 
 def reference_curve(case: Case) -> curves.Curve:

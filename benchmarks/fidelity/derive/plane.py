@@ -71,7 +71,7 @@ def _cells_near_plane(case: Case, cells: freespace.Lattice) -> tuple[Bool[np.nda
 
 
 def unknown_share(case: Case) -> float:
-    """Return the share of the candidate's free cells that no held-out beam shows."""
+    """Return the fraction of the candidate's free cells that no held-out beam shows."""
     _, known = _cells_near_plane(case, free_plane(case).lattice)
     return float(1.0 - known[free_plane(case).judged].mean())
 

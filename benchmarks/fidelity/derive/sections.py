@@ -17,7 +17,7 @@ SHELL_PARTS = ("lining", "joint", "pocket", "floor")  # parts of the truth that 
 SECTION_STEP = 1.0  # m
 SECTION_END = 0.75  # m from the mouths where no window is whole
 WIDTH_HEIGHT = 1.2  # m above the floor
-_CLOSED_SHARE = 0.7  # share of the directions that must meet the lining
+_CLOSED_SHARE = 0.7  # fraction of the directions that must meet the lining
 
 
 @dataclass(frozen=True)

@@ -228,7 +228,7 @@ def add_vertex_noise(site: Site, fault: Fault) -> Candidate:
 
 @fault_kind("coarse", "share of the faces that smoothing and decimation take", signed=False)
 def coarsen(site: Site, fault: Fault) -> Candidate:
-    """Smooths (Laplace, the more the larger the share) and then reduces the number of faces."""
+    """Smooths (Laplace, the more the larger the fraction) and then reduces the number of faces."""
     import pymeshlab
 
     share = fault.size
@@ -250,7 +250,7 @@ def coarsen(site: Site, fault: Fault) -> Candidate:
 
 # Bodies in the bore, and a mouth that is closed.
 
-EACH = 36.0  # m, the tunnels on which the points of the controls were set: a longer one gets its share
+EACH = 36.0  # m, the tunnels on which the points of the controls were set: a longer one gets its fraction
 _WALL_THICKNESS = 0.3  # m
 _DEBRIS_RADIUS = 0.3  # m
 _PILLAR_SIZE = (0.5, 0.4)  # m along and across the tunnel

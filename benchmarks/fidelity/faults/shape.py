@@ -247,7 +247,7 @@ def respace_sleepers(site: kinds.Site, fault: kinds.Fault) -> Candidate:
 
 @kinds.fault_kind("missing", "share of the sleepers missing", signed=False)
 def drop_sleepers(site: kinds.Site, fault: kinds.Fault) -> Candidate:
-    """Removes a share of the sleepers along the fault, evenly spread, with their fastenings."""
+    """Removes a fraction of the sleepers along the fault, evenly spread, with their fastenings."""
     track, line = site.candidate.track, site.line
     station = line.local(track.sleeper)[:, 0]
     inside = np.flatnonzero(fault.share(station) > 0.5)
@@ -264,7 +264,7 @@ def drop_sleepers(site: kinds.Site, fault: kinds.Fault) -> Candidate:
 
 @kinds.fault_kind("pockets", "share of the pockets' depth filled; below 0 they are too deep")
 def fill_pockets(site: kinds.Site, fault: kinds.Fault) -> Candidate:
-    """Takes a share of their depth from the pockets along the fault; 1 closes them and removes the nails in them."""
+    """Takes a fraction of their depth from the pockets along the fault; 1 closes them and removes the nails in them."""
     candidate, bore, line, factor = site.candidate, site.candidate.bore, site.line, 1.0 - fault.size
     if not len(bore.pocket):
         return candidate

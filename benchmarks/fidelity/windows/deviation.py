@@ -22,7 +22,7 @@ ANGLES = curves.section_angles(COLUMNS)
 TRACK = ("sleeper", "rail", "fastening")  # parts of a candidate that are no bore
 TRACK_SIDE = np.deg2rad(50.0)  # from straight down: what lies there may be track
 _STEEPEST = np.cos(np.deg2rad(80.0))  # beams that graze more steeply say little about where a surface is
-_BORE = 0.5  # share of a cell's returns off the candidate's track from which on it shows the bore
+_BORE = 0.5  # fraction of a cell's returns off the candidate's track from which on it shows the bore
 _MOUTH = 0.5  # m at the mouths that the truth's rays leave out
 
 

@@ -23,7 +23,7 @@ SHORT, LONG, HAND = 5.0, 10.0, 30.0  # m, lengths of the windows
 STEP = 1.0  # m between the starts of windows
 OFF_CELL = 0.05  # m; a cell of the surface that is farther off counts as off
 PLACES = ("left wall", "left haunch", "crown", "right haunch", "right wall", "right foot", "floor", "left foot")
-_LEAST_CELLS = 0.15  # share of a window's cells that must be known
+_LEAST_CELLS = 0.15  # fraction of a window's cells that must be known
 _LEAST_SECTOR = 6  # known cells of a window that show a sector
 _LEAST_BEAMS = 20
 _HAIR = 1e-6  # m, more than places that are one differ by rounding
@@ -222,7 +222,7 @@ class Worst:
     start: float | None = None
     end: float | None = None
     where: str = ""  # Part of the section; empty for all of it
-    judged: float = 0.0  # Share of the windows that have a value
+    judged: float = 0.0  # Fraction of the windows that have a value
     error: str = ""  # Cause why there is no value, if the computation broke
     foreign: str = ""  # Topic of a recording by a sensor that the limit was not set with; empty otherwise
 

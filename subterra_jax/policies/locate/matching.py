@@ -1,4 +1,4 @@
-"""The learnt front end: how well the profiles of two beams agree if commands were wrong by each of some shares.
+"""The learnt front end: how well the profiles of two beams agree if commands were wrong by each of some fractions.
 
 A point of the wall is first seen ahead and later behind. If the robot drives (1 + e) times the commanded distance, the
 two profiles are apart by e times the distance between the two places: many pairs of beams together tell e.
