@@ -8,7 +8,7 @@ from brax.envs.base import State, Wrapper
 from brax.training.agents.ppo import train as ppo
 from watch import Act, Watch, eased, features
 
-from subterra_jax.adapters.brax import RescaleAction, SubterraBraxEnv, jax_for_brax, wrap
+from subterra_jax.adapters.brax import SubterraBraxEnv, jax_for_brax, wrap
 
 
 class _Enough(Exception):
@@ -34,7 +34,7 @@ class Look(Wrapper):
 
     def step(self, state: State, action: jax.Array) -> State:
         """Drives one control period."""
-        state = self.env.step(state, eased(action))
+        state = self.env.step(state, eased(action, *self.unwrapped.action_bounds))
         return state.replace(obs=self.look(state.obs))
 
 
@@ -50,7 +50,7 @@ def train(watch: Watch, steps: int, seed: int) -> None:
 
             def act(weights: Any, obs: jax.Array) -> jax.Array:
                 action, _ = make_policy(weights, deterministic=True)(see(obs), jax.random.key(0))
-                return low + 0.5 * (eased(jnp.clip(action, -1.0, 1.0)) + 1.0) * (high - low)
+                return eased(action, low, high)
 
         if now and watch(now, Act(act, weights)):
             raise _Enough
@@ -58,7 +58,7 @@ def train(watch: Watch, steps: int, seed: int) -> None:
     try:
         with jax_for_brax():
             ppo.train(
-                environment=Look(RescaleAction(env), see),
+                environment=Look(env, see),
                 wrap_env_fn=wrap,
                 episode_length=env.episode_length,
                 num_timesteps=steps,

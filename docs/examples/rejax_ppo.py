@@ -10,22 +10,27 @@ import jax
 import jax.numpy as jnp
 import rejax
 from gymnax.environments.spaces import Box
-from watch import Act, Watch, features
+from watch import Act, Watch, eased, features
 
 from subterra_jax.adapters.gymnax import SubterraGymnax5
 
 
 class Seen(SubterraGymnax5):
-    """Shows features in place of observations."""
+    """Shows features in place of observations, and eases actions."""
 
     def __init__(self, task: str, **options: Any) -> None:
         super().__init__(task, **options)
-        self.look = features(self.env, self.default_params)
+        self.look, bounds = features(self.env, self.default_params), self.env.action_space(self.default_params)
+        self.bounds = bounds.low, bounds.high
 
     def observation_space(self, params: Any = None) -> Box:
         """Bounds of the features."""
         n = jax.eval_shape(self.look, jax.ShapeDtypeStruct(super().observation_space(params).shape, jnp.float32))
         return Box(-jnp.inf, jnp.inf, n.shape)
+
+    def action_space(self, params: Any = None) -> Box:
+        """Bounds of eased actions."""
+        return Box(-1.0, 1.0, (2,))
 
     def reset(self, key: jax.Array, params: Any = None) -> Any:
         """Begins an episode."""
@@ -34,7 +39,7 @@ class Seen(SubterraGymnax5):
 
     def step(self, key: jax.Array, state: Any, action: jax.Array, params: Any = None) -> Any:
         """Drives one control period."""
-        obs, *rest = super().step(key, state, action, params)
+        obs, *rest = super().step(key, state, eased(action, *self.bounds), params)
         return self.look(obs), *rest
 
 
@@ -60,13 +65,12 @@ def train(watch: Watch, steps: int, seed: int) -> None:
         skip_initial_evaluation=True,
     )
     trainer = trainer.replace(eval_callback=lambda trainer, state, key: ())
-    low, high = env.action_space().low, env.action_space().high
 
     def act(state: Any, obs: jax.Array) -> jax.Array:
         actor, rms = state
         obs = trainer.normalize_obs(rms, env.look(obs))
         mean = trainer.actor.apply(actor, obs[None], method=_mean)[0]
-        return jnp.clip(mean, low, high)
+        return eased(mean, *env.bounds)
 
     def _mean(actor: Any, obs: jax.Array) -> jax.Array:
         return actor._action_dist(obs).mode()

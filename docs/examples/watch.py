@@ -44,13 +44,14 @@ def features(env: TunnelEnv, params: EnvParams) -> Callable[[Array], Array]:
     return look
 
 
-def eased(action: Array) -> Array:
-    """Returns an action in [-1, 1], of which half of the speeds are 0 and turns are gentle.
+def eased(action: Float[Array, "2"], low: Array, high: Array) -> Float[Array, "2"]:
+    """Returns the command of an action in [-1, 1]: the robot stands in half of it, and turns gently.
 
-    Noise that throws a robot against the wall teaches it to end there, and who can stand only at the end of a range
-    never learns to.
+    Noise that throws a robot against the wall teaches it to end there, and it seldom stands still where it must be at
+    the end of a range to do so.
     """
-    return action.at[..., 0].multiply(2.0).at[..., 0].add(-1.0).at[..., 1].multiply(TURN)
+    ahead, turn = jnp.clip(action, -1.0, 1.0)
+    return jnp.stack([low[0] + jnp.maximum(ahead, 0.0) * (high[0] - low[0]), TURN * turn * high[1]])
 
 
 @struct.dataclass
