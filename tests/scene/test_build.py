@@ -115,13 +115,6 @@ def test_the_scene_loads_into_mjx_and_steps(scene):
     assert np.isfinite(np.asarray(data.qpos)).all()
 
 
-def test_the_same_input_gives_the_same_bytes(bore_file, scene, tmp_path):
-    build(bore_file, tmp_path / "bore")
-    for path in sorted(scene.rglob("*")):
-        if path.is_file():
-            assert path.read_bytes() == (tmp_path / "bore" / path.relative_to(scene)).read_bytes(), path.name
-
-
 def test_a_failed_build_leaves_the_previous_scene_whole(scene, tmp_path, command):
     before = {path: path.stat().st_mtime_ns for path in scene.rglob("*")}
     bad = tmp_path / "bad.ply"

@@ -272,8 +272,8 @@ def bore_of(points: np.ndarray) -> Bore:
 
 @pytest.mark.parametrize(
     ("name", "yaw", "tilt"),
-    [("T", *ORIENTATIONS[0]), ("T", *ORIENTATIONS[1]), ("short T", *ORIENTATIONS[0]), ("Y", *ORIENTATIONS[1]),
-     ("crossing", *ORIENTATIONS[1]), ("room on the way", *ORIENTATIONS[0])],
+    [("T", *ORIENTATIONS[1]), ("short T", *ORIENTATIONS[0]), ("Y", *ORIENTATIONS[1]), ("crossing", *ORIENTATIONS[1]),
+     ("room on the way", *ORIENTATIONS[0])],
 )  # fmt: skip
 def test_a_branch_or_a_room_is_warned_of_with_its_place_in_the_frame_of_the_input(name, yaw, tilt):
     result = cleaned(cavity(*JUNCTIONS[name], yaw=yaw, tilt=tilt))

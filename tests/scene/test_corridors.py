@@ -103,7 +103,7 @@ def _seen(points: np.ndarray, things: list[Thing], length: float) -> np.ndarray:
     return seen
 
 
-QUICK = ("racks", "shelves", "machines", "closets")
+QUICK = ("racks", "machines", "closets")
 
 
 def built(things: list[Thing], recesses: tuple[Thing, ...] = ()) -> tuple[Bore, Cleaned, np.ndarray, bool]:

@@ -18,7 +18,7 @@ from scene.reading.formats import ReadingConfig
 from scene.reading.recording import Recording
 from tests.scene.bags import write_bag
 
-RATE, COUNT, RAYS = 10.0, 90, 3000
+RATE, COUNT, RAYS = 10.0, 90, 2000
 
 
 def pose(time: np.ndarray) -> tuple[np.ndarray, Rotation]:

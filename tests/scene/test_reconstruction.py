@@ -27,7 +27,7 @@ def offsets(bore: Bore, cloud: Cloud, known: KnownBore) -> tuple[np.ndarray, np.
     return np.einsum("ij,ij->i", offset, bore.lateral), np.einsum("ij,ij->i", offset, bore.up)
 
 
-@pytest.mark.parametrize("yaw", [0.0, 2.3, -1.6])
+@pytest.mark.parametrize("yaw", [0.0, 2.3])
 def test_a_curved_d_bore_is_measured_in_any_orientation(yaw):
     known = curved_d_bore(yaw=yaw, per_metre=2000)
     bore, cloud = rebuilt(known.points)

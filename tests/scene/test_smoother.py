@@ -38,13 +38,12 @@ def test_prism_and_imu_give_place_and_attitude_however_the_imu_is_mounted(mounte
     np.testing.assert_allclose(chain.gyro_bias[-1], 0.003, atol=1e-3)
 
 
-@pytest.mark.parametrize("late", [0.026, -0.1])
-def test_the_clock_of_a_control_is_told_by_the_motion_that_it_shares_with_the_imu(late):
-    control = walks.control(DURATION)
-    control = replace(control, times=control.times + late)
-    problem, guess = inertial_problem(walks.inertial(DURATION), control, walks.LEVER, Noise())
+def test_the_clock_of_a_control_is_told_by_the_motion_that_it_shares_with_the_imu():
+    control = walks.control(18.0)
+    control = replace(control, times=control.times - 0.076)  # between the lags that are tried
+    problem, guess = inertial_problem(walks.inertial(18.0), control, walks.LEVER, Noise())
     lag = find_control_lag(problem, problem.solve(guess)[0], control)
-    assert lag == pytest.approx(late, abs=0.002)
+    assert lag == pytest.approx(-0.076, abs=0.002)
     json.dumps(lag > 0.0)  # a manifest holds no number of NumPy
 
 

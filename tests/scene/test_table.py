@@ -19,7 +19,7 @@ from tests.scene.messages import PLAIN, pointcloud2, write_bag1
 from tests.scene.test_odd_inputs import WKT, ptx, write_las
 
 pytestmark = pytest.mark.usefixtures("silent")
-POINTS = curved_d_bore(length=14.0, per_metre=3000, offset=(1.0, 2.0, 0.5)).points
+POINTS = curved_d_bore(length=12.0, per_metre=2000, offset=(1.0, 2.0, 0.5)).points
 TEXT = "".join("{:.4f} {:.4f} {:.4f} 9 1 2 3\n".format(*row) for row in POINTS)
 SOUND = {"clock_doubt": None, "pose_doubt": None}
 
@@ -115,8 +115,8 @@ ROWS = {
     "xz": Row(file("a.laz.xz", b"\xfd7zXZ"), "decompress it first: xz -d a.laz.xz", "", 2),
     "UTF-16": Row(file("a.xyz", TEXT.encode("utf-16")), "it is text in UTF-16; save it as UTF-8", "", 2),
     "degrees": Row(file("a.csv", b"lat lon h\n1 2 3\n"), "in degrees; project them to metres", "", 2),
-    "E57, half of it in the scanner": Row(write_e57, "left out: 21,000 points (no return)", ""),
-    "LAZ, points withheld, noise": Row(write_laz, "4,200 points (withheld), 2 points (noise)", "", facts={"crs": WKT}),
+    "E57, half of it in the scanner": Row(write_e57, "left out: 12,000 points (no return)", ""),
+    "LAZ, points withheld, noise": Row(write_laz, "2,400 points (withheld), 2 points (noise)", "", facts={"crs": WKT}),
     "PTX": Row(file("a.ptx", ptx(POINTS - 50.0, (50.0, 50.0, 50.0)).encode()), "format PTX", ""),
     "PTS": Row(file("a.pts", f"{len(POINTS)}\n{TEXT}".encode()), "registered cloud", ""),
     "two LiDARs": Row(small(("/front/points", "/rear/points", "/map")),

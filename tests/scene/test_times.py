@@ -105,14 +105,25 @@ def test_what_the_user_says_of_the_stamp_moves_the_sweeps(tmp_path):
     assert not any(scan.times.any() for scan in scans)
 
 
-def test_times_that_grow_by_no_unit_are_refused(tmp_path):
+def own_bag(path, late, time):
+    """Headers late by a number of each sweep, s, and times of points of a sensor of no known driver."""
     fields = [("x", "f4", 0), ("y", "f4", 4), ("z", "f4", 8), ("time", "f8", 16)]
     raw = [
-        (start, pointcloud2(start, fields, 24, {**dict(zip("xyz", points.T, strict=True)), "time": 30 * (k + offset)}))
-        for k, (start, points, offset) in enumerate(sweeps(12))
+        (at := start + late(k), pointcloud2(at, fields, 24, dict(zip("xyz", xyz.T, strict=True), time=time(k, offset))))
+        for k, (start, xyz, offset) in enumerate(sweeps(12))
     ]
+    return write_bag1(path, {"/points": raw})
+
+
+def test_times_that_grow_by_no_unit_are_refused(tmp_path):
     with pytest.raises(RecordingError, match=r"grow by 300 in a second of the headers: by no unit"):
-        read(write_bag1(tmp_path / "a.bag", {"/points": raw}))
+        read(own_bag(tmp_path / "a.bag", lambda k: 0.0, lambda k, offset: 30 * (k + offset)))
+
+
+def test_sweeps_by_another_clock_stand_as_even_as_it_runs_however_late_their_headers(tmp_path):
+    late, boot = lambda k: 0.004 * (k % 3), lambda k, offset: 320.0 + k / 10 + offset
+    scans, _ = read(own_bag(tmp_path / "a.bag", late, boot))
+    np.testing.assert_allclose(np.diff([scan.stamp for scan in scans]), 0.1, atol=5e-4)
 
 
 @pytest.mark.parametrize("how", [{"point_times": "epoch", "point_unit": "ns"}, {"container": "mcap", "pieces": 2}])

@@ -83,12 +83,13 @@ def test_planar_intensities_are_those_of_the_wall_and_a_pose_moves_none_of_it():
 def images():
     """By dial, images of two sweeps 0.5 m apart, unrolled in 5 cm cells, freed of what a plain wall shows."""
     made = {}
+    env, params = st.make(TASK, tunnel=straight(), sensor="vlp16", intensity=True, texture=1.0)
+    rays, state = np.asarray(params.lidar.directions, np.float64), placed(env, params, 15.0)
     for dial in (0.0, 0.5, 1.0):
-        env, params = st.make(TASK, tunnel=straight(), sensor="vlp16", intensity=True, texture=dial)
-        rays = np.asarray(params.lidar.directions, np.float64)
-        pair = []
+        params, pair = params.replace(lidar=params.lidar.replace(texture=dial)), []
         for key, x in enumerate((15.0, 15.5)):
-            seen = observe(env, placed(env, params, x), params, key)
+            there = state.replace(position=jnp.array([x, 0.0]), station=jnp.float32(x))
+            seen = observe(env, there, params, key)
             points = rays * seen["scan"][:, None] + (x, 0.0, 0.7)
             near = (seen["intensity"] > 0.0) & (np.abs(points[:, 0] - x) < 3.0) & (np.abs(points[:, 2] - 1.1) < 0.9)
             near &= np.abs(points[:, 1]) > HALF - 0.1  # the walls stand upright

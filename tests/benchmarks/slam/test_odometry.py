@@ -131,8 +131,8 @@ def test_recordings_without_the_channel_are_refused():
 
 def test_bag_and_batch_show_one_wall():
     bag = unrolled(1.0, seed=BATCH_SEED)[0]
-    station = np.linspace(0.0, 110.0, 221)
-    plan = st.tunnel.from_centreline(np.stack([station, np.zeros(221)], axis=-1), 2.8, lidar_height=0.7)
+    station = np.linspace(0.0, 65.0, 131)
+    plan = st.tunnel.from_centreline(np.stack([station, np.zeros(131)], axis=-1), 2.8, lidar_height=0.7)
     plan = dataclasses.replace(plan, texture=BATCH_SEED)
     env, params = st.make("Subterra/Traverse-v1", tunnel=plan, sensor="vlp16", intensity=True, texture=1.0)
     _, state = env.reset(jax.random.key(0), params)
