@@ -10,60 +10,66 @@ from typing import no_type_check
 
 import numpy as np
 from numba import njit
+from numba.cpython.unsafe.numbers import trailing_zeros
 
-from subterra_jax.native.threads import argument, as_float, least_of, result
+from subterra_jax.native.threads import argument, result
 from subterra_jax.tunnel import GROUP, WIDTH
 
 _F, _I, _U = np.float32, np.int32, np.uint64
 _ZERO, _ONE, _JOINT = _F(0.0), _F(1.0), _F(2e-7)
-_GROUP, _HALF, _WIDTH, _NONE = _U(GROUP), _U(GROUP // 2), _U(WIDTH), np.int32(0)
+_GROUP, _HALF, _WIDTH, _NONE = _U(GROUP), _U(GROUP // 2), _U(WIDTH), _I(0)
 
 compiled = njit(error_model="numpy", fastmath={"contract", "nnan", "nsz"}, forceinline=True)
 
 
 @compiled
 @no_type_check
-def _meet(wall, n_vertices, block, m_x, m_y, d_x, d_y, hit, work):
-    """Return the distance at which a beam meets a block whose middle is at `m_x`, `m_y`, if it is less than `hit`."""
+def _meet(wall, n_vertices, block, m_x, m_y, d_x, d_y, ahead, behind):
+    """Return the nearest walls ahead on a line and behind, also in a block whose middle is at `m_x`, `m_y`."""
     side, along = d_x * m_y - d_y * m_x, d_x * m_x + d_y * m_y
     joint = _JOINT * (_ONE + abs(along))
     at = _U(2) * n_vertices * block
     for some in range((n_vertices - _U(1)) // _WIDTH):
+        v, met = at + some * _WIDTH, _NONE
         for k in range(_WIDTH):
-            v = at + some * _WIDTH + k
-            x0, x1, y0, y1 = wall[v], wall[v + _U(1)], wall[n_vertices + v], wall[n_vertices + v + _U(1)]
+            x0, x1, y0, y1 = (
+                wall[v + k],
+                wall[v + k + _U(1)],
+                wall[n_vertices + v + k],
+                wall[n_vertices + v + k + _U(1)],
+            )
+            a, b = side + (d_x * y0 - d_y * x0), side + (d_x * y1 - d_y * x1)
+            low, high = (a if a < b else b), (b if a < b else a)
+            met = _I(met | (_I(1 << k) if (low <= joint) & (high >= -joint) else _NONE))
+        while met != _NONE:
+            i = v + _U(trailing_zeros(met))
+            x0, x1, y0, y1 = wall[i], wall[i + _U(1)], wall[n_vertices + i], wall[n_vertices + i + _U(1)]
             a, b = side + (d_x * y0 - d_y * x0), side + (d_x * y1 - d_y * x1)
             a_ahead, b_ahead = along + (d_x * x0 + d_y * y0), along + (d_x * x1 + d_y * y1)
             share = a / (_ONE if a == b else a - b)
             share = _ZERO if share < _ZERO else share
             share = _ONE if share > _ONE else share
             distance = a_ahead + share * (b_ahead - a_ahead)
-            low, high = (a if a < b else b), (b if a < b else a)
-            nearer = (low <= joint) & (high >= -joint) & (distance >= _ZERO) & (distance < hit)
-            work[k] = distance if nearer else hit
-        hit = as_float(least_of(work.ctypes.data))
-    return hit
+            ahead = distance if (distance >= _ZERO) & (distance < ahead) else ahead
+            behind = -distance if (distance <= _ZERO) & (-distance < behind) else behind
+            met = _I(met & (met - 1))
+    return ahead, behind
 
 
 @compiled
 @no_type_check
-def _look(box, n, wall, n_vertices, low, x, y, d_x, d_y, ahead, behind, gaps, work):
+def _look(box, n, wall, n_vertices, low, x, y, d_x, d_y, ahead, behind):
     """Return the nearest walls ahead on a line and behind, also in a group of blocks from `low` on."""
+    met = _NONE
     for k in range(_GROUP):
         i = low + k
         beside = abs(d_x * (box[n + i] - y) - d_y * (box[i] - x))
-        gaps[k] = beside - (abs(d_x * box[_U(3) * n + i] - d_y * box[_U(2) * n + i]) + box[_U(4) * n + i])
-    if least_of(gaps.ctypes.data) <= _NONE:
-        for k in range(_GROUP):
-            if gaps[k] <= _ZERO:
-                i = low + k
-                m_x, m_y = box[i] - x, box[n + i] - y
-                half = abs(d_x * box[_U(2) * n + i] + d_y * box[_U(3) * n + i]) + box[_U(4) * n + i]
-                along = d_x * m_x + d_y * m_y
-                if along + half >= _ZERO and along - half <= ahead:
-                    ahead = _meet(wall, n_vertices, i, m_x, m_y, d_x, d_y, ahead, work)
-                if half - along >= _ZERO and -along - half <= behind:
-                    behind = _meet(wall, n_vertices, i, m_x, m_y, -d_x, -d_y, behind, work)
+        gap = beside - (abs(d_x * box[_U(3) * n + i] - d_y * box[_U(2) * n + i]) + box[_U(4) * n + i])
+        met = _I(met | (_I(1 << k) if gap <= _ZERO else _NONE))
+    while met != _NONE:
+        i = low + _U(trailing_zeros(met))
+        ahead, behind = _meet(wall, n_vertices, i, box[i] - x, box[n + i] - y, d_x, d_y, ahead, behind)
+        met = _I(met & (met - 1))
     return ahead, behind
 
 
@@ -83,7 +89,6 @@ def scan_rows(results, operands, begin, end):
     n_vertices, ranges = _U(len(wall)) // (_U(2) * n), result(results, len(start) * len(turn) // 2)
     both = n_beams % _U(2) == _U(0)  # opposite beams share a line
     n_lines = n_beams // _U(2) if both else n_beams
-    gaps, work = np.empty(GROUP, np.float32), np.empty(WIDTH, np.float32)
     for row in range(_U(begin), _U(end)):
         if needed[row] == 0:
             continue
@@ -92,7 +97,7 @@ def scan_rows(results, operands, begin, end):
         for line in range(n_lines):
             d_x, d_y = cos * turn[line] - sin * turn[n_beams + line], sin * turn[line] + cos * turn[n_beams + line]
             ahead, behind = limit, (limit if both else _ZERO)
-            ahead, behind = _look(box, n, wall, n_vertices, middle, x, y, d_x, d_y, ahead, behind, gaps, work)
+            ahead, behind = _look(box, n, wall, n_vertices, middle, x, y, d_x, d_y, ahead, behind)
             for side in range(2):
                 way = _ONE if side == 0 else -_ONE
                 i = middle + _GROUP if side == 0 else middle - _U(1)
@@ -103,7 +108,7 @@ def scan_rows(results, operands, begin, end):
                     if gap > _ZERO and gap > ahead * speed and gap > -behind * speed:
                         break
                     low = i if side == 0 else i - (_GROUP - _U(1))
-                    ahead, behind = _look(box, n, wall, n_vertices, low, x, y, d_x, d_y, ahead, behind, gaps, work)
+                    ahead, behind = _look(box, n, wall, n_vertices, low, x, y, d_x, d_y, ahead, behind)
                     i = i + _GROUP if side == 0 else i - _GROUP
             ranges[n_beams * row + line] = ahead
             if both:
@@ -112,7 +117,7 @@ def scan_rows(results, operands, begin, end):
 
 @compiled
 @no_type_check
-def _squared(wall, n_vertices, block, m_x, m_y, best, work):
+def _squared(wall, n_vertices, block, m_x, m_y, best):
     """Return the squared distance to a block's nearest segment, m², if it is less than `best`."""
     at = _U(2) * n_vertices * block
     for some in range((n_vertices - _U(1)) // _WIDTH):
@@ -127,8 +132,7 @@ def _squared(wall, n_vertices, block, m_x, m_y, best, work):
             share = _ONE if share > _ONE else share
             near_x, near_y = x + share * edge_x, y + share * edge_y
             squared = near_x * near_x + near_y * near_y
-            work[k] = squared if squared < best else best
-        best = as_float(least_of(work.ctypes.data))
+            best = squared if squared < best else best
     return best
 
 
@@ -140,7 +144,6 @@ def clearance_rows(results, operands, begin, end):
     box, wall, reach = argument(operands, 2), argument(operands, 3), argument(operands, 4)[0]
     n, distance = _U(len(box) // 10), result(results, len(start))
     n_vertices = _U(len(wall)) // (_U(2) * n)
-    work = np.empty(WIDTH, np.float32)
     for row in range(_U(begin), _U(end)):
         x, y, best = position[_U(2) * row], position[_U(2) * row + _U(1)], reach * reach
         for side in range(2):
@@ -155,6 +158,6 @@ def clearance_rows(results, operands, begin, end):
                 near = reach + box[_U(4) * n + i] + _F(1e-5)
                 beside = abs(m_x * e_y - m_y * e_x) <= near * half
                 if beside and abs(m_x * e_x + m_y * e_y) <= (half + near) * half:
-                    best = _squared(wall, n_vertices, i, m_x, m_y, best, work)
+                    best = _squared(wall, n_vertices, i, m_x, m_y, best)
                 i = i + _U(1) if side == 0 else i - _U(1)
         distance[row] = _F(math.sqrt(best))

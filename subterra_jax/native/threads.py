@@ -5,6 +5,7 @@ its job.
 """
 
 import os
+import sys
 import threading
 from collections.abc import Callable
 from types import FunctionType
@@ -68,34 +69,6 @@ def result_of_many(addresses, i, size):
 
 
 @intrinsic
-def least_of(typing: Any, address: Any) -> Any:
-    """Return the least of 16 numbers of 32 bits, read as whole numbers.
-
-    As numbers, floats that are not negative have the order of their bits, and a negative one has a negative number.
-    Compilers read such a row one by one, which takes as long as making it.
-    """
-
-    def emit(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
-        eight = ir.VectorType(ir.IntType(32), 8)
-        first = builder.inttoptr(args[0], eight.as_pointer())
-        one, two = (builder.load(builder.gep(first, [ir.IntType(64)(k)]), align=4) for k in range(2))
-        less = builder.select(builder.icmp_signed("<", one, two), one, two)
-        kind = ir.FunctionType(ir.IntType(32), [eight])
-        name = "llvm.vector.reduce.smin.v8i32"
-        return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), [less])
-
-    return signature(types.int32, types.intp), emit
-
-
-@intrinsic
-def as_float(typing: Any, number: Any) -> Any:
-    """Return the float of some 32 bits."""
-    return signature(types.float32, types.int32), lambda context, builder, sig, args: builder.bitcast(
-        args[0], ir.FloatType()
-    )
-
-
-@intrinsic
 def _exchange(typing: Any, address: Any, old: Any, new: Any) -> Any:
     """Write a number over an old one if it still stands there, at once for all threads; return what stood there."""
 
@@ -144,13 +117,13 @@ def _take(at):
 def _serve(at):
     call, words = np.zeros(1, np.int64), carray(_addresses_at(at), (_WORDS,))
     while True:
-        if _read(types.int32(words[_READ]), call.ctypes.data, 1) == 1:
+        if _read(types.int32(words[_READ]), call.ctypes.data, 8) == 8:
             take(at)
 
 
 @no_type_check
 def _answer(results, operands, _, _length, _status):
-    sizes, at, call = _ints_at(_addresses_at(operands)[0]), job(), np.zeros(1, np.int64)
+    sizes, at, call = _ints_at(_addresses_at(operands)[0]), job(), np.ones(1, np.int64)
     rows, threads = sizes[0], sizes[1]
     # Another call may be under way, on another device of this process.
     if threads < 2 or _exchange(at + 8 * _BUSY, 0, 1) != 0:
@@ -164,7 +137,7 @@ def _answer(results, operands, _, _length, _status):
     words[_DONE] = 0
     _add(at + 8 * _STATE, -_ALL_TAKEN)
     for _ in range(1, threads):
-        _write(types.int32(words[_WRITE]), call.ctypes.data, 1)
+        _write(types.int32(words[_WRITE]), call.ctypes.data, 8)
     take(at)
     # Those that others have begun; none waits for a thread that has not woken.
     while _add(at + 8 * _DONE, 0) < rows:
@@ -186,6 +159,17 @@ def _address_of(symbol: str) -> Any:
     return address
 
 
+def _bell() -> tuple[int, int]:
+    """Return two files: what is written to the second wakes a thread that reads from the first.
+
+    A pipe wakes its reader on the core of the writer, which goes on working there; Linux has something better.
+    """
+    if sys.platform != "linux":
+        return os.pipe()
+    bell = os.eventfd(0, os.EFD_SEMAPHORE | os.EFD_CLOEXEC)
+    return bell, bell
+
+
 def handler_of(work: Callable[..., None], name: str, helpers: int, cache: bool) -> tuple[Any, ...]:
     """Return a handler of XLA's, and what its threads need; the first operand of a call is as `sizes_of` makes it.
 
@@ -204,7 +188,7 @@ def handler_of(work: Callable[..., None], name: str, helpers: int, cache: bool) 
         return made
 
     symbol, words = f"{name}_job", np.zeros(_WORDS, np.int64)
-    words[_READ], words[_WRITE], words[_STATE] = *os.pipe(), _ALL_TAKEN
+    words[_READ], words[_WRITE], words[_STATE] = *_bell(), _ALL_TAKEN
     binding.add_symbol(symbol, words.ctypes.data)
     take = njit(own(_take, work=work))
     serve = cfunc(types.void(types.intp), cache=cache)(own(_serve, take=take))
