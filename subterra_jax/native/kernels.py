@@ -24,32 +24,32 @@ compiled = njit(error_model="numpy", fastmath={"contract", "nnan", "nsz"}, force
 
 @compiled
 @no_type_check
+def _left(wall, n_vertices, v, side, d_x, d_y):
+    return side + (d_x * wall[n_vertices + v] - d_y * wall[v])
+
+
+@compiled
+@no_type_check
 def _meet(wall, n_vertices, block, m_x, m_y, d_x, d_y, ahead, behind):
     """Return the nearest walls ahead on a line and behind, also in a block whose middle is at `m_x`, `m_y`."""
     side, along = d_x * m_y - d_y * m_x, d_x * m_x + d_y * m_y
     joint = _JOINT * (_ONE + abs(along))
     at = _U(2) * n_vertices * block
     for some in range((n_vertices - _U(1)) // _WIDTH):
-        v, met = at + some * _WIDTH, _NONE
+        first, met = at + some * _WIDTH, _NONE
         for k in range(_WIDTH):
-            x0, x1, y0, y1 = (
-                wall[v + k],
-                wall[v + k + _U(1)],
-                wall[n_vertices + v + k],
-                wall[n_vertices + v + k + _U(1)],
-            )
-            a, b = side + (d_x * y0 - d_y * x0), side + (d_x * y1 - d_y * x1)
+            v = first + k
+            a, b = _left(wall, n_vertices, v, side, d_x, d_y), _left(wall, n_vertices, v + _U(1), side, d_x, d_y)
             low, high = (a if a < b else b), (b if a < b else a)
             met = _I(met | (_I(1 << k) if (low <= joint) & (high >= -joint) else _NONE))
+        # As a rule a line crosses one segment of a block: division is for that one.
         while met != _NONE:
-            i = v + _U(trailing_zeros(met))
-            x0, x1, y0, y1 = wall[i], wall[i + _U(1)], wall[n_vertices + i], wall[n_vertices + i + _U(1)]
-            a, b = side + (d_x * y0 - d_y * x0), side + (d_x * y1 - d_y * x1)
-            a_ahead, b_ahead = along + (d_x * x0 + d_y * y0), along + (d_x * x1 + d_y * y1)
-            share = a / (_ONE if a == b else a - b)
-            share = _ZERO if share < _ZERO else share
-            share = _ONE if share > _ONE else share
-            distance = a_ahead + share * (b_ahead - a_ahead)
+            v = first + _U(trailing_zeros(met))
+            a, b = _left(wall, n_vertices, v, side, d_x, d_y), _left(wall, n_vertices, v + _U(1), side, d_x, d_y)
+            share = min(max(a / (_ONE if a == b else a - b), _ZERO), _ONE)
+            start = along + (d_x * wall[v] + d_y * wall[n_vertices + v])
+            end = along + (d_x * wall[v + _U(1)] + d_y * wall[n_vertices + v + _U(1)])
+            distance = start + share * (end - start)
             ahead = distance if (distance >= _ZERO) & (distance < ahead) else ahead
             behind = -distance if (distance <= _ZERO) & (-distance < behind) else behind
             met = _I(met & (met - 1))
@@ -78,12 +78,8 @@ def _look(box, n, wall, n_vertices, low, x, y, d_x, d_y, ahead, behind):
 def scan_rows(results, operands, begin, end):
     """Take the scans `begin` to `end` of a call: start, needed, position, heading, box, wall, turn, limit to ranges."""
     start, needed = argument(operands, 0).view(_I), argument(operands, 1).view(_I)
-    position, heading, box, wall = (
-        argument(operands, 2),
-        argument(operands, 3),
-        argument(operands, 4),
-        argument(operands, 5),
-    )
+    position, heading = argument(operands, 2), argument(operands, 3)
+    box, wall = argument(operands, 4), argument(operands, 5)
     turn, limit = argument(operands, 6), argument(operands, 7)[0]
     n, n_beams = _U(len(box) // 10), _U(len(turn) // 2)
     n_vertices, ranges = _U(len(wall)) // (_U(2) * n), result(results, len(start) * len(turn) // 2)
@@ -127,9 +123,7 @@ def _squared(wall, n_vertices, block, m_x, m_y, best):
             edge_x, edge_y = wall[v + _U(1)] - wall[v], wall[n_vertices + v + _U(1)] - wall[n_vertices + v]
             size = edge_x * edge_x + edge_y * edge_y
             # Padding repeats a vertex: a segment of length 0, whose nearest point is its start.
-            share = -(x * edge_x + y * edge_y) / (size if size > _ZERO else _ONE)
-            share = _ZERO if share < _ZERO else share
-            share = _ONE if share > _ONE else share
+            share = min(max(-(x * edge_x + y * edge_y) / (size if size > _ZERO else _ONE), _ZERO), _ONE)
             near_x, near_y = x + share * edge_x, y + share * edge_y
             squared = near_x * near_x + near_y * near_y
             best = squared if squared < best else best

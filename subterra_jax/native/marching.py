@@ -8,7 +8,7 @@ from numba import njit
 from subterra_jax.lidar3d.cells import FACES, MARGIN, N_FACES, N_WEDGES, N_X, NEAR_UNIT, STEP_BITS, X_BITS
 from subterra_jax.lidar3d.meeting import FINE, PAST, SEAM
 from subterra_jax.lidar3d.relief import N_FRAME, N_LINK
-from subterra_jax.native.threads import argument, result_of_many
+from subterra_jax.native.threads import addresses_at, argument, result
 
 _F, _I, _W = np.float32, np.int32, np.uint32
 _ZERO, _ONE, _FAR, _TINY = _F(0.0), _F(1.0), _F(np.inf), _F(1e-12)
@@ -183,8 +183,8 @@ def march_rows(results, operands, begin, end):
     frame, link = argument(operands, 4), argument(operands, 5).view(_I)
     cell, entry = argument(operands, 6).view(_I), argument(operands, 7).view(_I)
     vertex, box = argument(operands, 8).view(_I), argument(operands, 9)
-    distance, found = result_of_many(results, 0, len(block)), result_of_many(results, 1, len(block)).view(_I)
-    home = result_of_many(results, 2, len(block)).view(_I)
+    found_at, n = addresses_at(results), len(block)
+    distance, found, home = result(found_at[0], n), result(found_at[1], n).view(_I), result(found_at[2], n).view(_I)
     for ray in range(begin, end):
         here, reached, farthest = np.int64(block[ray]), _ZERO, limit[ray]
         hit, which, at_home = _FAR, -1, here

@@ -1,6 +1,6 @@
 """Custom calls of XLA by plain pointers, without a C compiler: a handler shares the rows of a call among threads.
 
-The threads wait for jobs at a pipe as long as the process lives: on virtual machines, to start one takes longer than
+The threads wait for jobs at a file as long as the process lives: on virtual machines, to start one takes longer than
 its job.
 """
 
@@ -25,7 +25,7 @@ _read = types.ExternalFunction("read", signature(types.intp, types.int32, types.
 _write = types.ExternalFunction("write", signature(types.intp, types.int32, types.intp, types.intp))
 _yield = types.ExternalFunction("sched_yield", signature(types.int32))
 # Words of the job that threads share: addresses of results and operands, rows, rows of a chunk, rows done, the state,
-# whether there is a job, and the two ends of the pipe. The state counts jobs above and rows taken below `_ROW_BITS`.
+# whether there is a job, and the two ends of that file. The state counts jobs above and rows taken below `_ROW_BITS`.
 _RESULTS, _OPERANDS, _ROWS, _CHUNK, _DONE, _STATE, _BUSY, _READ, _WRITE, _WORDS = range(10)
 _ROW_BITS, _ALL_TAKEN = 32, (1 << 32) - 1
 
@@ -43,29 +43,22 @@ def _at(kind: types.Type) -> Any:
     return at
 
 
-_addresses_at, _ints_at, _floats_at = _at(types.intp), _at(types.int32), _at(types.float32)
+addresses_at, _ints_at, _floats_at = _at(types.intp), _at(types.int32), _at(types.float32)
 
 
 @njit
 @no_type_check
 def argument(operands, i):
     """Return the i-th argument as a flat array of float32; `.view` gives other numbers of 32 bits."""
-    sizes = _ints_at(_addresses_at(operands)[0])
-    return carray(_floats_at(_addresses_at(operands)[i + 1]), (sizes[i + 3],))
+    sizes = _ints_at(addresses_at(operands)[0])
+    return carray(_floats_at(addresses_at(operands)[i + 1]), (sizes[i + 3],))
 
 
 @njit
 @no_type_check
 def result(address, size):
-    """Return the only result as a flat array, as `argument`."""
+    """Return the result at an address as a flat array, as `argument`; several are at `addresses_at` the one given."""
     return carray(_floats_at(address), (size,))
-
-
-@njit
-@no_type_check
-def result_of_many(addresses, i, size):
-    """Return the i-th of several results as a flat array, as `argument`."""
-    return carray(_floats_at(_addresses_at(addresses)[i]), (size,))
 
 
 @intrinsic
@@ -100,7 +93,7 @@ def _take(at):
 
     Whoever takes one sees the job that it is of: the state has not changed since that was read.
     """
-    words = carray(_addresses_at(at), (_WORDS,))
+    words = carray(addresses_at(at), (_WORDS,))
     while True:
         state = _add(at + 8 * _STATE, 0)
         begin, rows, chunk = state & _ALL_TAKEN, words[_ROWS], words[_CHUNK]
@@ -115,7 +108,7 @@ def _take(at):
 
 @no_type_check
 def _serve(at):
-    call, words = np.zeros(1, np.int64), carray(_addresses_at(at), (_WORDS,))
+    call, words = np.zeros(1, np.int64), carray(addresses_at(at), (_WORDS,))
     while True:
         if _read(types.int32(words[_READ]), call.ctypes.data, 8) == 8:
             take(at)
@@ -123,13 +116,13 @@ def _serve(at):
 
 @no_type_check
 def _answer(results, operands, _, _length, _status):
-    sizes, at, call = _ints_at(_addresses_at(operands)[0]), job(), np.ones(1, np.int64)
+    sizes, at, call = _ints_at(addresses_at(operands)[0]), job(), np.ones(1, np.int64)
     rows, threads = sizes[0], sizes[1]
     # Another call may be under way, on another device of this process.
     if threads < 2 or _exchange(at + 8 * _BUSY, 0, 1) != 0:
         work(results, operands, 0, rows)
         return
-    words = carray(_addresses_at(at), (_WORDS,))
+    words = carray(addresses_at(at), (_WORDS,))
     # A thread that comes late to the job before finds it taken, and no other until this one is written down.
     state = words[_STATE]
     _add(at + 8 * _STATE, ((state >> _ROW_BITS) + 1 << _ROW_BITS) + _ALL_TAKEN - state)
@@ -159,17 +152,6 @@ def _address_of(symbol: str) -> Any:
     return address
 
 
-def _bell() -> tuple[int, int]:
-    """Return two files: what is written to the second wakes a thread that reads from the first.
-
-    A pipe wakes its reader on the core of the writer, which goes on working there; Linux has something better.
-    """
-    if sys.platform != "linux":
-        return os.pipe()
-    bell = os.eventfd(0, os.EFD_SEMAPHORE | os.EFD_CLOEXEC)
-    return bell, bell
-
-
 def handler_of(work: Callable[..., None], name: str, helpers: int, cache: bool) -> tuple[Any, ...]:
     """Return a handler of XLA's, and what its threads need; the first operand of a call is as `sizes_of` makes it.
 
@@ -188,7 +170,9 @@ def handler_of(work: Callable[..., None], name: str, helpers: int, cache: bool) 
         return made
 
     symbol, words = f"{name}_job", np.zeros(_WORDS, np.int64)
-    words[_READ], words[_WRITE], words[_STATE] = *_bell(), _ALL_TAKEN
+    # A pipe wakes its reader on the core of the writer, which goes on working there.
+    ends = (os.eventfd(0, os.EFD_SEMAPHORE),) * 2 if sys.platform == "linux" else os.pipe()
+    words[_READ], words[_WRITE], words[_STATE] = *ends, _ALL_TAKEN
     binding.add_symbol(symbol, words.ctypes.data)
     take = njit(own(_take, work=work))
     serve = cfunc(types.void(types.intp), cache=cache)(own(_serve, take=take))
