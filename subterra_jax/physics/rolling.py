@@ -26,9 +26,10 @@ def rover_spec() -> mujoco.MjSpec:
     """Return the rover alone, with the options of the engine."""
     spec = mujoco.MjSpec.from_string(ElementTree.tostring(rover.rover_mjcf(), encoding="unicode"))
     set_options(spec)
+    spec.option.iterations = 2  # with one, wheels slip on sleepers by 8 % more than with ten
     for wheel in rover.WHEELS:
         # Its speed loop by the implicit Euler method: (M + h D) a = f. So contacts are solved for the wheel that the
-        # motor holds, and one iteration does where three were needed.
+        # motor holds, and two iterations do.
         spec.joint(wheel).armature += TIMESTEP * rover.GAIN
     return spec
 
@@ -66,7 +67,9 @@ class Rover(Physical):
         def control(ride: Ride, nothing: None) -> tuple[Ride, tuple[Array, ...]]:
             ride, _, gap, wrong = advance_period(self.engine, ride, drive.wheels, None, params.track, tunnel)
             speeds = ride.body.qvel
-            counted = jnp.stack([rover.ROLLED * jnp.mean(speeds[6:]), speeds[5]])
+            sleepers = params.track.protrusion[ride.anchor] > 0.0
+            rolled = jnp.where(sleepers, rover.ROLLED_ON_SLEEPERS, rover.ROLLED)
+            counted = jnp.stack([rolled * jnp.mean(speeds[6:]), speeds[5]])
             return ride, (gap, wrong | has_tipped(ride.body), counted)
 
         ride, (gap, fallen, counted) = lax.scan(control, state.parts[self.name], None, length=self.periods)
