@@ -282,7 +282,9 @@ def _midline(left: Float[np.ndarray, "k 2"], right: Float[np.ndarray, "m 2"]) ->
         tangent = np.gradient(line, axis=0)
         normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=-1) / np.linalg.norm(tangent, axis=1, keepdims=True)
         to_left, to_right = _reaches(line, normal, left, right)
-        line = line + _smooth(0.5 * (to_left - to_right), spacing)[:, None] * normal
+        with np.errstate(invalid="ignore"):  # where neither wall is met, which is left out
+            aside = 0.5 * (to_left - to_right)
+        line = line + _smooth(aside, spacing)[:, None] * normal
     return line
 
 

@@ -218,6 +218,7 @@ def ugly_walls(rng: np.random.Generator) -> list[np.ndarray]:
     return walls
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_ugly_tunnels_are_exact_or_refused_in_one_sentence():
     seeds, plans, poses, refusals = [], [], [], []
     for seed in range(100):
