@@ -8,9 +8,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
 from scene.geometry import Axis, make_axis
+from subterra_jax.host.unrolled import Sections, Unrolled, unroll
 
 SCHEMA = "subterra.bore/1"
 STATION_STEP = 0.25
+_STRAIGHT = 1e-5  # 1/m
 
 _PATCH = [(name, "f8") for name in ("station", "angle", "length", "width", "depth", "confidence")]
 POCKET = np.dtype([*_PATCH, ("measured", "?")])
@@ -62,6 +64,45 @@ class Bore:
         """Return the points of the smooth wall in the tunnel frame, m."""
         across, along = self.radius * np.cos(self.angle), self.radius * np.sin(self.angle)
         return self.position[:, None] + across[..., None] * self.lateral[:, None] + along[..., None] * self.up[:, None]
+
+    @property
+    def wall(self) -> Sections:
+        """Smooth wall, by which meshes and casts go."""
+        return Sections(self.station, self.position, self.tangent, self.lateral, self.up, self.angle, self.radius)
+
+    @property
+    def recesses(self) -> Float[np.ndarray, "p 5"]:
+        """Station, m, angle, rad, length, width and depth, m, of each pocket."""
+        return np.column_stack([self.pocket[name] for name in ("station", "angle", "length", "width", "depth")])
+
+    def recess_boxes(self, pocket: Int[np.ndarray, " r"]) -> Float[np.ndarray, "r 8 3"]:
+        """Return corners of some pockets as boxes square to the wall they are sunk into, m."""
+        chosen = self.recesses[pocket]
+        return self.wall.recess_boxes(chosen, self.axis.at(chosen[:, 0]).tangent)
+
+    def unrolled(self) -> Unrolled:
+        """Return the mean section's arc length; the seam is in the widest gap between recesses, else at the floor."""
+        taken = np.sort(self.pocket["angle"] % (2 * np.pi))
+        gap = np.diff(np.append(taken, taken[0] + 2 * np.pi)) if len(taken) else np.empty(0)
+        seam = taken[np.argmax(gap)] + gap.max() / 2 if len(taken) else 1.5 * np.pi
+        return unroll(self.angle, self.radius.mean(axis=0), seam)
+
+    def find_fold(self) -> float | None:
+        """Return the first station at which a section cuts the next one, m; `None` where none does."""
+        step = np.einsum("nmi,ni->nm", np.diff(self.surface(), axis=0), self.tangent[:-1] + self.tangent[1:])
+        folded = np.flatnonzero((step <= 0).any(axis=1))
+        return float(self.station[folded[0]]) if len(folded) else None
+
+    def describe(self) -> dict[str, Any]:
+        """Return residual, coverage and alignment for the manifest; a straight bore has no plan radius."""
+        axis = self.axis
+        bend = float(np.abs(axis.curvature).max())
+        return {
+            "residual_rms": float(np.sqrt(np.mean(self.residual_rms**2))),
+            "coverage": float(self.coverage.mean()),
+            "least_plan_radius": 1 / bend if bend > _STRAIGHT else None,
+            "grade": [float(axis.grade.min()), float(axis.grade.max())],
+        }
 
     def save(self, path: Path) -> None:
         """Writes `bore.npz`, with curvature and grade of the axis; the same bore gives the same bytes."""

@@ -20,9 +20,9 @@ import tyro
 from scene.cleaning.clean import clean_cloud, crop_cloud, turn_round
 from scene.config import BuildConfig, ReconstructConfig, check_settings
 from scene.errors import Code, FitError, RecordingError, require_input
-from scene.fitting.assemble import describe_bore, fit_unfolded
 from scene.fitting.lining import add_lining
 from scene.fitting.rings import fit_ring_survey
+from scene.fitting.section import fit_unfolded
 from scene.fitting.trackseen import find_track, measure_gauge
 from scene.inputs import hash_inputs
 from scene.judging.judge import Judgement, JudgingConfig, Warned, judge_bore, require_trust
@@ -198,7 +198,7 @@ def _fit_cloud(placed: Placed, config: ReconstructConfig, progress: Stages) -> R
     facts = {
         "length_fixed_by": "registered cloud as given", **placed.facts,
         **_describe_growth(config, _ARBITRARY if located is None else "with the trajectory"), "returns": cloud.returns,
-        "points": len(cloud.points), "flat_floor": sections.flat_floor, **describe_bore(bore),
+        "points": len(cloud.points), "flat_floor": sections.flat_floor, **bore.describe(),
     }  # fmt: skip
     removed = tuple(part.shifted(-sections.grid.start) for part in cleaned.removed)
     return Reconstruction(

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any
 
 from scene.cleaning.clean import ExtentConfig
-from scene.fitting.assemble import CentrelineConfig
+from scene.fitting.axis import CentrelineConfig
 from scene.fitting.lining import LiningConfig
 from scene.judging.judge import JudgingConfig
 from scene.reading.formats import ReadingConfig

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from benchmarks.fidelity.files import FidelityError, file_hash
 from scene.poses.trajectory import load_tum
 from scene.reading.recording import Recording
-from scene.reading.scans import POINTCLOUD2_TYPE, cloud_records
+from scene.reading.rosbag import POINTCLOUD2_TYPE, cloud_records
 from scene.reading.source import stack_points
 from scene.reading.times import Scan, make_scan, time_field
 

@@ -94,11 +94,6 @@ class Metric:
     def scored(self) -> bool:
         return self.role in "SG"
 
-    @property
-    def rises(self) -> bool:
-        """True where a larger value is better."""
-        return self.map.kind in "UP" or self.map == LOGGED_UP
-
     def as_row(self) -> dict[str, Any]:
         """Return everything that a verdict depends on, as plain data."""
         plain = asdict(replace(self, compute=str, of=None))

@@ -19,7 +19,7 @@ from scene.cleaning.sort import Cleaned, look_around, part_of_cloud, sort_points
 from scene.cleaning.tube import Tube, find_plane_walls, measure_tube
 from scene.cloud import Cloud, thin_cloud
 from scene.errors import Cause, FitError, Refusal
-from scene.fitting.assemble import CentrelineConfig, centre_axis, smooth_axis
+from scene.fitting.axis import CentrelineConfig, centre_axis, smooth_axis
 from scene.geometry import Axis, bin_angles
 
 _COARSE = 0.15  # m, voxel of the cloud that is followed

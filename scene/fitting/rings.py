@@ -10,7 +10,6 @@ from scipy.optimize import least_squares
 
 from scene.bore import POCKET, STATION_STEP, Bore
 from scene.errors import FitError, Refusal
-from scene.fitting.assemble import describe_bore
 from scene.fitting.lining import LiningConfig, add_standard_lining, joints_by_number
 from scene.geometry import arc_length, axis_through, section_angles
 from scene.reading.ringsurvey import RingSurvey
@@ -140,7 +139,7 @@ def fit_ring_survey(
     facts = {
         "kind": "ring survey", **survey.facts, "rings": len(fit.names), "first_ring": fit.names[0],
         "last_ring": fit.names[-1], "length_fixed_by": "total-station survey", "radius_mean": float(fit.radius.mean()),
-        "radius_sd": float(fit.radius.std()), **describe_bore(bore),
+        "radius_sd": float(fit.radius.std()), **bore.describe(),
         "residual_rms": float(np.sqrt(np.mean(fit.rms**2))),
         "largest_target_offset": float(max(offset.max() for offset in survey.offsets)), "flat_floor": False,
     }  # fmt: skip

@@ -14,8 +14,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from scene.poses.registration import deskew
-from scene.poses.trajectory import Trajectory
+from scene.poses.trajectory import Trajectory, deskew
 from scene.reading.recording import Recording
 from scene.reading.times import Scan
 

@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from scene.cloud import Cloud
 from scene.inputs import input_files
-from scene.poses.place import Located, Placed
+from scene.poses.locate import Located
+from scene.poses.place import Placed
 from scene.poses.trajectory import Trajectory
 from subterra_jax.host.files import replace_file
 from subterra_jax.host.versions import VERSION

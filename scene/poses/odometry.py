@@ -13,8 +13,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from scene.errors import FitError, Refusal
-from scene.poses.registration import deskew
-from scene.poses.trajectory import Trajectory
+from scene.poses.trajectory import Trajectory, deskew
 from scene.progress import Stage
 from scene.reading.recording import Recording
 from scene.reading.times import Scan

@@ -1,4 +1,4 @@
-"""TUM files: poses over time, and positions of a prism without attitude."""
+"""Poses over time, what they make of a sweep, and TUM files of them or of a prism without attitude."""
 
 import re
 from dataclasses import dataclass
@@ -11,11 +11,12 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from scene.errors import RecordingError, require_input
 from scene.reading.source import cause
-from scene.reading.times import seconds_in
+from scene.reading.times import Scan, seconds_in
 
 _NUMBER = re.compile(r"[-+]?\.?\d[^a-zA-Z]")
 _HEADER = re.compile(r"(?i)\bq_?(?:rs_)?[wx]")
 _QUATERNION_TOLERANCE = 0.01  # by which the length of a quaternion may differ from 1
+_KNOTS = 21  # poses interpolated per sweep; between two of them, 5 ms, a walker's motion is straight
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,23 @@ class Trajectory:
         clipped = np.clip(times, self.times[0], self.times[-1])
         positions = np.stack([np.interp(clipped, self.times, column) for column in self.positions.T], axis=1)
         return positions, self._slerp(clipped)
+
+
+def deskew(scan: Scan, trajectory: Trajectory) -> Float[np.ndarray, "n 3"]:
+    """Return the scan's points in the trajectory's frame, m."""
+    span = float(scan.times.max(initial=0.0))
+    knots = np.linspace(0.0, max(span, 1e-9), _KNOTS)
+    positions, rotations = trajectory.at(scan.stamp + knots)
+    at = scan.times / knots[-1] * (_KNOTS - 1)
+    low = np.minimum(at.astype(np.intp), _KNOTS - 2)
+    share = (at - low)[:, None]
+    matrices = rotations.as_matrix()
+    points = scan.points.astype(np.float64)
+
+    def from_pose(knot: np.ndarray) -> np.ndarray:
+        return np.einsum("nij,nj->ni", matrices[knot], points) + positions[knot]
+
+    return (1 - share) * from_pose(low) + share * from_pose(low + 1)
 
 
 def save_tum(trajectory: Trajectory, path: Path) -> None:

@@ -1,13 +1,9 @@
-"""Sweeps as recordings hold them: Livox and PointCloud2 messages, folders of sweeps, and what a reader returns.
+"""What a reader of recordings returns, and folders of sweeps.
 
 A folder has one file a sweep (PCD, PLY or KITTI .bin), and times from a list or from the files' names.
-
-Source of Livox' layout: livox_ros_driver, message md5 e4d6829bdfe657cb6c21a746c86b21a6; livox_ros_driver2 publishes the
-same fields.
 """
 
 import re
-import struct
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -19,7 +15,7 @@ from jaxtyping import Shaped
 
 from scene.errors import RecordingError
 from scene.reading.ply_pcd import read_pcd_records, read_ply_records
-from scene.reading.source import INTENSITIES, cause, stack_points
+from scene.reading.source import cause, stack_points
 from scene.reading.times import RawScan, make_scan, seconds_in, time_field
 
 
@@ -83,88 +79,6 @@ def scan_from_records(stamp: float, records: Shaped[np.ndarray, " n"]) -> RawSca
     intensity = points[:, 3] if points.shape[1] > 3 else None
     scan = make_scan(stamp, points[:, :3], None if name is None else records[name], name or "", intensity)
     return replace(scan, unit=unit)
-
-
-LIVOX_TYPES = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
-
-_LIVOX_POINT = np.dtype([
-    ("offset_time", "<u4"), ("x", "<f4"), ("y", "<f4"), ("z", "<f4"),
-    ("reflectivity", "u1"), ("tag", "u1"), ("line", "u1"),
-])  # fmt: skip
-# CDR aligns each point's first word: one byte of padding between points, none after the last.
-_LIVOX_POINT_CDR = np.dtype({"names": ["point"], "formats": [_LIVOX_POINT], "itemsize": _LIVOX_POINT.itemsize + 1})
-# Bits 4-5 of the tag: 0b00 and 0b01 are returns to trust, the others are noise by intensity or by place.
-_TAG_RETURN_MASK = 0x20
-
-
-def parse_custom_msg(raw: bytes, cdr: bool = False) -> RawScan:
-    """Parses a `CustomMsg` as ROS1 serialises it, or ROS2 (CDR, little-endian); `ValueError` where it is no whole one.
-
-    Points at the origin (no return), not finite, or tagged as noise are dropped.
-    """
-    try:
-        if cdr and raw[:2] != b"\x00\x01":
-            raise ValueError(f"encapsulation {raw[:2].hex()} is not little-endian CDR")
-        body = raw[4:] if cdr else raw  # alignment counts from behind the encapsulation header
-        secs, nsecs, frame_length = struct.unpack_from("<iII" if cdr else "<4xIII", body, 0)
-        timebase = -(-(12 + frame_length) // 8) * 8 if cdr else 16 + frame_length
-        offset = timebase + struct.calcsize("<QIB3B")
-        (count,) = struct.unpack_from("<I", body, offset)
-        if cdr:
-            body += b"\0" * (len(body) == offset + 3 + count * _LIVOX_POINT_CDR.itemsize)  # the last padding may miss
-            points = np.frombuffer(body, _LIVOX_POINT_CDR, count, offset + 4)["point"]
-        else:
-            points = np.frombuffer(body, _LIVOX_POINT, count, offset + 4)
-    except (struct.error, ValueError) as error:
-        raise ValueError(f"not a whole CustomMsg: {error}") from error
-    points = points[points["tag"] & _TAG_RETURN_MASK == 0]
-    xyz = np.stack([points["x"], points["y"], points["z"]], axis=1)
-    scan = make_scan(secs + nsecs * 1e-9, xyz, points["offset_time"], "offset_time", points["reflectivity"])
-    return replace(scan, unit="ns")
-
-
-POINTCLOUD2_TYPE = "sensor_msgs/msg/PointCloud2"
-# Source: sensor_msgs/PointField, INT8 = 1 … FLOAT64 = 8.
-_FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-
-
-def cloud_records(message: Any) -> Shaped[np.ndarray, " n"]:
-    """Return the points of a PointCloud2 as records of x, y, z and any time, without padding at the end of rows.
-
-    Raises `ValueError` without coordinates, or for a layout that contradicts itself.
-    """
-    width, height, step, row = message.width, message.height, message.point_step, message.row_step
-    if not width * height:
-        return np.empty(0, [("x", "f4"), ("y", "f4"), ("z", "f4")])
-    layout = _record_layout(message, step)
-    data = np.asarray(message.data, np.uint8)
-    row = row or width * step
-    if row < width * step or (height - 1) * row + width * step > len(data):
-        raise ValueError(
-            f"a PointCloud2 of {height} rows of {width} points of {step} bytes (row_step {row}) in {len(data)} bytes"
-        )
-    if row == width * step:
-        return np.frombuffer(data.tobytes(), layout, width * height)
-    return np.concatenate([np.frombuffer(data[k * row :].tobytes(), layout, width) for k in range(height)])
-
-
-def _record_layout(message: Any, step: int) -> np.dtype:
-    order = ">" if message.is_bigendian else "<"
-    names = [field.name for field in message.fields]
-    needed = {time_field(names)[0], *(name for name in names if name.lower() in ("x", "y", "z", *INTENSITIES))}
-    fields: dict[str, tuple[str, int]] = {}
-    for field in message.fields:
-        if field.name in needed and field.name not in fields:
-            if field.datatype not in _FIELD_TYPES:
-                raise ValueError(f"a PointCloud2 whose field {field.name} is of unknown type {field.datatype}")
-            fields[field.name] = (order + _FIELD_TYPES[field.datatype], field.offset)
-    if missing := [name for name in "xyz" if name not in map(str.lower, fields)]:
-        raise ValueError(f"a PointCloud2 without the field {', '.join(missing)}")
-    for name, (kind, offset) in fields.items():
-        if offset + np.dtype(kind).itemsize > step:
-            raise ValueError(f"a PointCloud2 whose field {name} at byte {offset} lies outside its {step}-byte points")
-    formats, offsets = zip(*fields.values(), strict=True)
-    return np.dtype({"names": list(fields), "formats": formats, "offsets": offsets, "itemsize": step})
 
 
 _FORMATS = {".pcd": "PCD", ".ply": "PLY", ".bin": "KITTI bin"}

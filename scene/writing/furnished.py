@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 from scene.bore import POCKET, Bore
 from scene.writing.markup import rotation_along
 from scene.writing.track import Track, wall_offset
-from scene.writing.unrolled import recess_boxes, unroll_section
 from scene.writing.walls import Opening
 
 _ROBOT_HEIGHT = 1.0  # m: what begins lower a robot may run into
@@ -258,7 +257,7 @@ def furnish_bore(bore: Bore, track: Track, config: FurnitureConfig) -> Furnished
         keep &= ~_overlaps(bore, row)
     with_niches = replace(bore, pocket=np.concatenate([bore.pocket[keep], niche]))
     number = np.arange(keep.sum(), len(with_niches.pocket))
-    corners = [_cut_flush(box) for box in recess_boxes(with_niches, number)]
+    corners = [_cut_flush(box) for box in with_niches.recess_boxes(number)]
     pieces = place_furniture(TunnelSpace(bore, track, config, spans)) + [_niche_door(corner) for corner in corners]
     return Furnished(with_niches, pieces, openings, spans, corners)
 
@@ -306,7 +305,7 @@ def _niche_openings(bore: Bore, track: Track, config: FurnitureConfig) -> list[O
 
 
 def _niche_pockets(bore: Bore, openings: list[Opening], depth: float) -> np.ndarray:
-    plane, rows = unroll_section(bore), []
+    plane, rows = bore.unrolled(), []
     for opening in openings:
         first, last = bore.station[list(opening.rows)]
         low, high = np.sort(plane.to_around(bore.angle[list(opening.columns)]))
@@ -317,7 +316,7 @@ def _niche_pockets(bore: Bore, openings: list[Opening], depth: float) -> np.ndar
 
 def _overlaps(bore: Bore, niche: np.void) -> np.ndarray:
     """True for the pockets that a niche takes away."""
-    plane, pocket = unroll_section(bore), bore.pocket
+    plane, pocket = bore.unrolled(), bore.pocket
     across = np.abs(plane.to_around(pocket["angle"]) - plane.to_around(niche["angle"]))
     across = np.minimum(across, plane.girth - across)
     beside = np.abs(pocket["station"] - niche["station"]) < (pocket["length"] + niche["length"]) / 2 + _FRAME

@@ -9,9 +9,9 @@ from manifold3d import Manifold, Mesh64, OpType
 
 from scene.bore import Bore
 from scene.errors import FitError, Refusal
-from scene.fitting.assemble import find_fold
-from scene.writing.unrolled import SPACING, recess_boxes, recesses, sections_of, unroll_section, wall_points
 from subterra_jax.host.unrolled import BAND, close_mouths, corners, open_mouths, rectangles, roll_up, triangulate
+
+SPACING = (0.18, 0.2)  # of the triangulated wall's points, along and around, m
 
 
 def build_solid(bore: Bore, pockets: bool) -> Manifold:
@@ -20,20 +20,20 @@ def build_solid(bore: Bore, pockets: bool) -> Manifold:
     With `pockets`, the recesses of the lining are part of the air. Raises `FitError` where sections fold into each
     other.
     """
-    if (fold := find_fold(bore)) is not None:
+    if (fold := bore.find_fold()) is not None:
         why = f"the sections fold into each other at {fold:.1f} m; is the curve too tight for the width?"
         raise FitError(why, Refusal.FOLDED)
-    plane, sections = unroll_section(bore), sections_of(bore)
-    pocket = recesses(bore) if pockets else np.empty((0, 5))
+    plane, wall = bore.unrolled(), bore.wall
+    pocket = bore.recesses if pockets else np.empty((0, 5))
     boxes, apart = rectangles(plane, bore.length, pocket, BAND * SPACING[1])
     creases = np.sort(plane.to_around(corners(bore.angle, bore.radius.mean(axis=0))))
     sheet = triangulate(plane, bore.length, creases, boxes[apart], SPACING)
-    vertex, faces = close_mouths(sections, sheet, *roll_up(sections, plane, sheet, pocket[apart]))
+    vertex, faces = close_mouths(wall, sheet, *roll_up(wall, plane, sheet, pocket[apart]))
     solid = Manifold(Mesh64(np.ascontiguousarray(vertex), np.ascontiguousarray(faces.astype(np.uint64))))
     if solid.is_empty():
         raise FitError(f"the sections do not make a solid ({solid.status().name})", Refusal.FOLDED)
     if not apart.all():
-        crowded = [Manifold.hull_points(box) for box in recess_boxes(bore, np.flatnonzero(~apart))]
+        crowded = [Manifold.hull_points(box) for box in bore.recess_boxes(np.flatnonzero(~apart))]
         solid = solid + Manifold.batch_boolean(crowded, OpType.Add)
     return max(solid.decompose(), key=lambda part: part.volume())
 
@@ -51,7 +51,7 @@ def join_meshes(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
 
 def open_lining(solid: trimesh.Trimesh, bore: Bore) -> trimesh.Trimesh:
     """Return the solid's surface without its two mouths, normals towards the axis, from which it is seen."""
-    kept = open_mouths(sections_of(bore), solid.vertices, solid.faces)
+    kept = open_mouths(bore.wall, solid.vertices, solid.faces)
     lining = trimesh.Trimesh(solid.vertices, kept[:, ::-1], process=False)
     lining.remove_unreferenced_vertices()
     return lining
@@ -101,7 +101,7 @@ def split_skin(
     angle = np.arctan2(up, lateral)
     height = chunk.vertices[:, 2] - np.interp(station, bore.station, bed)
     low = (np.abs(height[chunk.faces]) < _FLOOR_HEIGHT).all(axis=1) & (chunk.face_normals[:, 2] > _LEVEL)
-    depth = np.linalg.norm(chunk.vertices - wall_points(bore, station, angle), axis=1)
+    depth = np.linalg.norm(chunk.vertices - bore.wall.points(station, angle), axis=1)
     sunk = (depth[chunk.faces] > _SUNK).any(axis=1) & ~low
     parts: dict[str, tuple[trimesh.Trimesh, Coordinates | None]] = {}
     for name, chosen in (("lining", ~low & ~sunk), ("recess", sunk), ("floor", low)):
@@ -123,7 +123,7 @@ def split_skin(
 
 def _wall_texture(bore: Bore, station: np.ndarray, angle: np.ndarray, corner: np.ndarray) -> Coordinates:
     """Texture coordinates: one picture a turn and two rings; faces across the seam go beyond one."""
-    plane = unroll_section(bore)
+    plane = bore.unrolled()
     u = plane.to_around(angle) / plane.girth
     v = _ring_number(bore, station) / 2
     wraps = np.ptp(u[corner], axis=1) > 0.5

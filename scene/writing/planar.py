@@ -13,7 +13,6 @@ from scene.bore import Bore
 from scene.errors import FitError, Refusal
 from scene.writing.mesh import has_rings
 from scene.writing.track import TrackConfig
-from scene.writing.unrolled import unroll_section
 from subterra_jax.host.tunnelfile import write_tunnel
 
 _SEEN = ("0", "1")  # groups of geoms that a camera sees
@@ -30,7 +29,7 @@ class Variant:
 
 def seams(variants: dict[str, Variant]) -> dict[str, float]:
     """Return the angle at which the wall of each variant is cut open to be unrolled, rad, by field."""
-    return {f"shell_seam_{name}": float(unroll_section(each.bore).angle[0]) for name, each in variants.items()}
+    return {f"shell_seam_{name}": float(each.bore.unrolled().angle[0]) for name, each in variants.items()}
 
 
 def shell_fields(

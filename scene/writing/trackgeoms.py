@@ -13,7 +13,6 @@ from scene.writing import markup
 from scene.writing.markup import SceneParts, add_box
 from scene.writing.mesh import join_meshes
 from scene.writing.track import Line, RailProfile, Track, TrackConfig
-from scene.writing.unrolled import wall_points
 from subterra_jax.host.rover import GROUND, RAIL, ROLL, SOLID
 
 # Engineering defaults, not sourced: plan size of a pad; cast shoulder; a clip of 20 mm bar, e-shaped from above, from
@@ -93,7 +92,7 @@ def nail_mesh(bore: Bore, start: float, end: float) -> trimesh.Trimesh | None:
     if not len(chosen):
         return None
     at = bore.axis.at(chosen["station"])
-    wall, parts = wall_points(bore, chosen["station"], chosen["angle"]), []
+    wall, parts = bore.wall.points(chosen["station"], chosen["angle"]), []
     for k, nail in enumerate(chosen):
         outward = np.cos(nail["angle"]) * at.lateral[k] + np.sin(nail["angle"]) * at.up[k]
         frame = np.eye(4)

@@ -10,7 +10,7 @@ from rich.console import Console
 from scene.bore import POCKET, STATION_STEP, Bore
 from scene.build import build
 from scene.config import BuildConfig
-from scene.fitting.assemble import measure_extents
+from scene.fitting.section import measure_extents
 from scene.geometry import N_ANGLES, axis_through, section_angles
 from scene.survey.config import SurveyConfig
 from scene.survey.simulate import simulate

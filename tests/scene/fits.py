@@ -6,8 +6,8 @@ from scene.bore import Bore
 from scene.cleaning.clean import clean_cloud
 from scene.cleaning.sort import Cleaned
 from scene.cloud import Cloud, VoxelMean
-from scene.fitting.assemble import CentrelineConfig, bore_from_sections
-from scene.fitting.section import Sections, fit_sections
+from scene.fitting.axis import CentrelineConfig
+from scene.fitting.section import Sections, bore_from_sections, fit_sections
 from scene.geometry import Axis, axis_through
 
 

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from scene.cleaning.sort import part_of_cloud
 from scene.cloud import VoxelMean, thin_cloud
 from scene.errors import RecordingError
-from scene.poses.registration import register_scans
+from scene.poses.place import register_scans
 from scene.poses.trajectory import Trajectory
 from scene.progress import Stages
 from scene.reading.cloudfile import read_cloud

@@ -7,7 +7,8 @@ from scene.bore import Bore
 from scene.cleaning.clean import clean_cloud
 from scene.cleaning.sort import Cleaned
 from scene.errors import Cause
-from scene.fitting.assemble import CentrelineConfig, fit_unfolded
+from scene.fitting.axis import CentrelineConfig
+from scene.fitting.section import fit_unfolded
 from scene.judging.judge import JudgingConfig, judge_bore
 from tests.scene.fits import thin
 

@@ -9,8 +9,8 @@ from scipy.ndimage import gaussian_filter
 from scene.bore import Bore
 from scene.cloud import Cloud
 from scene.fitting import section
-from scene.fitting.assemble import find_fold, fit_unfolded
 from scene.fitting.lining import LiningConfig, add_lining, add_standard_lining, pair_pockets
+from scene.fitting.section import fit_unfolded
 from scene.fitting.unroll import fill_sides
 from scene.geometry import axis_through
 from tests.scene import railway
@@ -213,8 +213,8 @@ def test_an_axis_that_bends_so_sharply_that_sections_fold_is_smoothed():
     jump = 0.9 / (1.0 + np.exp((L / 2 - along) / 0.12))  # as at the end of a platform
     path = np.column_stack([along, jump - 0.4, 2.9 + 0.01 * along]) + PLACE - cloud.origin
     axis = axis_through(path, 0.25)
-    assert find_fold(bore_about(axis, cloud)) is not None
+    assert bore_about(axis, cloud).find_fold() is not None
     _, bore = fit_unfolded(cloud, axis, 12.0)
-    assert find_fold(bore) is None
+    assert bore.find_fold() is None
     assert np.abs(bore.axis.curvature).max() < 0.3
     assert np.median(bore.width) == pytest.approx(5.5, abs=0.05)

@@ -10,7 +10,7 @@ from scene.cleaning.sort import list_removed, sort_points
 from scene.cleaning.tube import Tube, bridge_hanging
 from scene.cloud import Cloud
 from scene.errors import Cause, FitError
-from scene.fitting.assemble import section_middles
+from scene.fitting.axis import section_middles
 from scene.fitting.section import fit_sections, visible_span
 from scene.fitting.unroll import Grid
 from scene.geometry import Around, axis_through

@@ -6,7 +6,7 @@ import trimesh
 from pypcd4 import PointCloud
 
 from scene.errors import RecordingError
-from scene.poses.registration import register_scans
+from scene.poses.place import register_scans
 from scene.poses.trajectory import load_tum
 from scene.progress import Stages
 from scene.reading.recording import Recording
