@@ -3,7 +3,7 @@
 from typing import Any
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from subterra_jax.b2 import constants as b2
 from subterra_jax.b2.gait import standing_gait
@@ -18,37 +18,45 @@ from subterra_jax.b2.params import (
     WalkStepNoise,
 )
 from subterra_jax.physics.engine import Body, Build
+from subterra_jax.physics.riding import place_on
 from subterra_jax.physics.rotations import compose, rotate, yaw_quaternion
+from subterra_jax.state import State
 
 _LATERAL, _HEADING, _MARGIN = 0.2, 0.2, 25.0  # of starts: m, rad, m
 _TURN, _SIDESTEP, _AIM, _FREE = 1.5, 1.0, 1.5, 0.5  # of steering: 1/s, 1/s, rad/m, rad
 
 
-def begin(noise: WalkResetNoise, params: WalkParams) -> WalkState:
-    """Return the start of an episode: standing at a sleeper, near the axis, facing either way along the tunnel."""
+def begin(noise: WalkResetNoise, params: WalkParams, plane: State | None = None) -> WalkState:
+    """Return the start of an episode: standing at a sleeper, near the axis, facing either way along the tunnel.
+
+    Args:
+        plane: Position, heading, station and lateral offset at which it stands instead, with no command.
+    """
     along, lateral, heading, way, phase = noise.place
-    facing = jnp.where(way < 0.0, -1.0, 1.0)
-    anchor = _start_sleeper(along, params)
-    along_track = params.track.quaternion[anchor]
-    turn = _HEADING * heading + jnp.where(facing < 0.0, jnp.pi, 0.0)
-    # The feet stand on the tops of the sleepers, or fall the little way to the ballast.
-    position = rotate(along_track, jnp.stack([0.0, _LATERAL * lateral, b2.STAND_HEIGHT]))
-    quaternion = compose(along_track, yaw_quaternion(turn))
-    pose, _ = standing_pose()
-    body = Body(jnp.concatenate([position, quaternion, pose]), jnp.zeros(18), jnp.zeros(18))
-    gait = standing_gait(0.5 * (phase + 1.0))
-    command = draw_command(noise.command, params.command)
+    if plane is None:
+        facing, command = jnp.where(way < 0.0, -1.0, 1.0), draw_command(noise.command, params.command)
+        anchor = _start_sleeper(along, params)
+        along_track, station = params.track.quaternion[anchor], params.track.station[anchor]
+        turn = _HEADING * heading + jnp.where(facing < 0.0, jnp.pi, 0.0)
+        # The feet stand on the tops of the sleepers, or fall the little way to the ballast.
+        position = rotate(along_track, jnp.stack([0.0, _LATERAL * lateral, b2.STAND_HEIGHT]))
+        placed = jnp.concatenate([position, compose(along_track, yaw_quaternion(turn))])
+    else:
+        facing, command, station = jnp.ones(()), jnp.zeros(3), plane.station
+        placed, anchor = place_on(params.track, plane, b2.STAND_HEIGHT)
+    body = Body(jnp.concatenate([placed, standing_pose()[0]]), jnp.zeros(18), jnp.zeros(18))
+    gait, pose = standing_gait(0.5 * (phase + 1.0)), locate(body, params.track.quaternion[anchor])
     return WalkState(
         body=body,
         anchor=anchor,
         gait=gait,
-        command=keep_on_track(command, locate(body, along_track), facing, params.command),
+        command=keep_on_track(command, pose, facing, params.command),
         drawn_command=command,
         facing=facing,
         action=jnp.zeros(12),
         proprioception=measure(body, noise.sensor, jnp.zeros(2), gait, params.sensor, params.gait),
         build=_draw_build(noise.build, params.randomisation),
-        furthest=params.track.station[anchor],
+        furthest=station,
         steps=jnp.zeros((), jnp.int32),
     )
 
@@ -62,17 +70,18 @@ def _start_sleeper(along: Float[Array, ""], params: WalkParams) -> Int[Array, ""
     return jnp.clip((share * count).astype(jnp.int32), 0, last)
 
 
+def _between(limits: Any, share: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Number between two limits, for a share in [-1, 1)."""
+    return limits[0] + 0.5 * (share + 1.0) * (limits[1] - limits[0])
+
+
 def _draw_build(noise: Float[Array, "29"], params: RandomisationParams) -> Build:
-
-    def between(limits: Any, share: Float[Array, "..."]) -> Float[Array, "..."]:
-        return limits[0] + 0.5 * (share + 1.0) * (limits[1] - limits[0])
-
     return Build(
-        friction=between(params.friction, noise[0]),
-        mass=between(params.mass, noise[1]),
+        friction=_between(params.friction, noise[0]),
+        mass=_between(params.mass, noise[1]),
         shift=jnp.asarray(params.shift) * noise[2:5],
-        stiffness=between(params.gain, noise[5:17]),
-        damping=between(params.gain, noise[17:29]),
+        stiffness=_between(params.gain, noise[5:17]),
+        damping=_between(params.gain, noise[17:29]),
     )
 
 
@@ -92,8 +101,7 @@ def draw_command(noise: Float[Array, "4"], params: CommandParams) -> Float[Array
         noise: Uniform in [-1, 1): for the three velocities, and for standing.
         params: Limits of the commands.
     """
-    low, high = jnp.asarray(params.low), jnp.asarray(params.high)
-    drawn = low + 0.5 * (noise[:3] + 1.0) * (high - low)
+    drawn = _between((jnp.asarray(params.low), jnp.asarray(params.high)), noise[:3])
     return jnp.where(0.5 * (noise[3] + 1.0) < params.still, 0.0, drawn)
 
 
@@ -116,9 +124,4 @@ def keep_on_track(
     limit = params.corridor
     left = jnp.clip(drawn[1], _SIDESTEP * (-limit - offset), _SIDESTEP * (limit - offset))
     kept = jnp.clip(jnp.stack([drawn[0], left, yaw_rate]), jnp.asarray(params.low), jnp.asarray(params.high))
-    return jnp.where(is_standing(drawn), 0.0, kept)
-
-
-def is_standing(command: Float[Array, "3"]) -> Bool[Array, ""]:
-    """Return whether a command asks to stand."""
-    return (command[0] == 0.0) & (command[1] == 0.0) & (command[2] == 0.0)
+    return jnp.where(jnp.all(drawn == 0.0), 0.0, kept)

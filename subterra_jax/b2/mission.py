@@ -11,14 +11,12 @@ from jax import lax
 from jaxtyping import Array, PRNGKeyArray
 
 from subterra_jax.b2 import constants as b2
-from subterra_jax.b2 import draws, observation
-from subterra_jax.b2.kinematics import standing_pose
-from subterra_jax.b2.params import WalkParams, WalkResetNoise, WalkState, WalkStepNoise
+from subterra_jax.b2 import draws
+from subterra_jax.b2.params import WalkResetNoise, WalkState, WalkStepNoise
 from subterra_jax.b2.walk import WalkEnv
 from subterra_jax.parts import Drive, Moved
 from subterra_jax.parts.part import Batch, Keys
-from subterra_jax.physics.engine import Body
-from subterra_jax.physics.riding import Physical, place_on
+from subterra_jax.physics.riding import Physical
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel import Tunnel
 
@@ -50,7 +48,7 @@ class Legs(Physical):
         return self.walk.draw_step(key, (*batch, PERIODS), params.walk)
 
     def begin(self, draw: WalkResetNoise, state: State, params: EnvParams) -> WalkState:
-        return stand(state, draw, params.walk)
+        return draws.begin(draw, params.walk, state)
 
     def move(self, state: State, drive: Drive, noise: WalkStepNoise, tunnel: Tunnel, params: EnvParams) -> Moved:
         """Walk for one control period of the task; see `Motion.move`."""
@@ -70,27 +68,3 @@ class Legs(Physical):
         walk, (counted, gap, contact, fall) = lax.scan(control, walk, noise)
         wheels, clear = jnp.mean(counted, axis=0), jnp.min(gap)
         return self.moved(state, walk, wheels, clear, jnp.any(contact), jnp.any(fall), tunnel, params)
-
-
-def stand(plane: State, noise: WalkResetNoise, walk: WalkParams) -> WalkState:
-    """Make a robot that stands where a planar state says, on the ground, with no command.
-
-    Args:
-        plane: Position, heading, station and lateral offset.
-        noise: Random numbers for its build, the clock of its gait and its first readings.
-        walk: The robot and its track.
-    """
-    placed, anchor = place_on(walk.track, plane, b2.STAND_HEIGHT)
-    pose, _ = standing_pose()
-    body = Body(jnp.concatenate([placed, pose]), jnp.zeros(18), jnp.zeros(18))
-    drawn = draws.begin(noise, walk)
-    return dataclasses.replace(
-        drawn,
-        body=body,
-        anchor=anchor,
-        command=jnp.zeros(3),
-        drawn_command=jnp.zeros(3),
-        facing=jnp.ones(()),
-        proprioception=observation.measure(body, noise.sensor, jnp.zeros(2), drawn.gait, walk.sensor, walk.gait),
-        furthest=plane.station,
-    )

@@ -14,7 +14,7 @@ from subterra_jax.b2.observation import gravity_direction, locate, true_velocity
 from subterra_jax.b2.params import WalkParams, WalkResetNoise, WalkState, WalkStepNoise
 from subterra_jax.env import Box, Info
 from subterra_jax.physics.engine import Body, Build, Engine
-from subterra_jax.physics.riding import Ride, advance_period
+from subterra_jax.physics.riding import Ride, advance_period, has_tipped
 
 N_ACTION, N_SENSOR = 12, 30  # sizes of an action, and of the noise of the sensors
 _STIFFNESS, _DAMPING, _TORQUE = (
@@ -114,13 +114,13 @@ class WalkEnv:
         ride, _, clear, wrong = advance_period(self.physics, pushed, targets, state.build, params.track, params.tunnel)
         body, anchor = ride.body, ride.anchor
         pose = locate(body, params.track.quaternion[anchor])
-        upright = -gravity_direction(body)[2]
-        fallen = wrong | (pose.height < params.fall_height) | (upright < jnp.cos(params.fall_tilt))
+        fallen = wrong | (pose.height < params.fall_height) | has_tipped(body, params.fall_tilt)
         torque = servo_torques(body, targets, state.build)
         terms = reward_terms(body, gait_state, torque, action, state.action, fallen, params, period)
         station = params.track.station[anchor] + pose.ahead
         furthest, steps = jnp.maximum(state.furthest, station), state.steps + 1
-        expired, outside = steps >= params.horizon, self._outside(station, params)
+        expired, ends = steps >= params.horizon, params.track.station
+        outside = (station < ends[0]) | (station > ends[-1])
         proprioception = observation.measure(
             body, noise.sensor, state.proprioception.velocity, gait_state, params.sensor, params.gait
         )
@@ -159,9 +159,6 @@ class WalkEnv:
         """Return the observation of a state, which holds it already; `noise` and `needed` change nothing."""
         own = observation.observe_self(state)
         return jnp.concatenate([own, observation.observe_truth(state, params.track)]) if self.privileged else own
-
-    def _outside(self, station: Float[Array, ""], params: WalkParams) -> Bool[Array, ""]:
-        return (station < params.track.station[0]) | (station > params.track.station[-1])
 
 
 def _push(body: Body, noise: WalkStepNoise, period: float, params: WalkParams) -> Body:

@@ -7,6 +7,7 @@ import io
 import threading
 from collections.abc import Callable
 from functools import cached_property
+from operator import itemgetter
 from typing import Any
 
 import jax
@@ -218,15 +219,11 @@ class MujocoEngine(Engine):
     def placed(self) -> mujoco.MjSpec:
         """Return the world with the robot in it."""
         spec, robot = self.world(), self.machine.spec()
-        option, own = spec.option, robot.option
-        option.timestep, option.integrator, option.cone = own.timestep, own.integrator, own.cone
-        option.disableflags = own.disableflags
-        # MuJoCo warns where the two differ when they are joined.
-        option.iterations, option.ls_iterations = own.iterations, own.ls_iterations
+        spec.option = robot.option  # MuJoCo warns where the two differ when they are joined
         spec.attach(robot, prefix=PREFIX, frame=spec.worldbody.add_frame())
-        option.iterations, option.ls_iterations = _ITERATIONS, _LINE_SEARCH
+        spec.option.iterations, spec.option.ls_iterations = _ITERATIONS, _LINE_SEARCH
         # Thousands of geoms that stand still are placed once, not in every step: the same bits in a third of the time.
-        option.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
+        spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
         return spec
 
     @cached_property
@@ -241,16 +238,13 @@ class MujocoEngine(Engine):
 
     def run_rows(self, body: Body, control: Any, origin: Any, build: Build | None) -> Body:
         """Advance any number of robots by one control period; all arrays have the same leading axes."""
-        leaves, structure = jax.tree.flatten((body, control, origin, build))
         batch = np.shape(body.qpos)[:-1]
         n = int(np.prod(batch))
-        rows = [np.asarray(leaf).reshape(n, *np.shape(leaf)[len(batch) :]) for leaf in leaves]
-        each: Any = (jax.tree.unflatten(structure, [row[k] for row in rows]) for k in range(n))
+        in_rows = lambda leaf: np.asarray(leaf).reshape(n, *np.shape(leaf)[len(batch) :])  # noqa: E731
+        rows: Any = jax.tree.map(in_rows, (body, control, origin, build))
+        each: Any = (jax.tree.map(itemgetter(k), rows) for k in range(n))
         after = [self.bench.run(one[0], one[1], one[2], one[3], self.substeps) for one in each]
-        stacked: Any = [
-            np.reshape(part, (*batch, *part[0].shape)) for part in zip(*map(jax.tree.leaves, after), strict=True)
-        ]
-        return Body(*stacked)
+        return jax.tree.map(lambda *parts: np.reshape(parts, (*batch, *parts[0].shape)), *after)
 
 
 class Workbench:

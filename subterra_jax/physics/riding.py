@@ -95,8 +95,11 @@ class Physical(Unicycle):
     on_the_plan: ClassVar[bool] = False
 
     def defaults(self) -> dict[str, Any]:
-        """Return `vehicle`, the limits of a command; and `track`, the ground."""
-        return {**super().defaults(), "track": None}
+        """Return `vehicle`, the limits of a command; `track`, the ground; and `relief`, the surface that a LiDAR sees.
+
+        None is the planar tunnel with upright walls, or in three dimensions the tunnel's own surface.
+        """
+        return {**super().defaults(), "track": None, "relief": None}
 
     def in_tunnel(self, params: EnvParams, tunnel: Any) -> EnvParams:
         """Return params that hold one tunnel of a stack; that tunnel's ground is the first there."""
@@ -176,10 +179,6 @@ class SwayingLidar(PlanarLidar):
 
     motion: Physical = dataclasses.field(default_factory=Physical)
 
-    def defaults(self) -> dict[str, Any]:
-        """Return `lidar`, and `relief`: the surface that it sees; None for the planar tunnel with upright walls."""
-        return {**super().defaults(), "relief": None}
-
     def true_ranges(self, own: Any, sensing: SensingState, params: EnvParams) -> Array:
         """Cast the beams from the trunk, m."""
         ride = sensing.parts[self.motion.name]
@@ -199,10 +198,6 @@ class SwayingSpatialLidar(SpatialLidar):
     """
 
     motion: Physical = dataclasses.field(default_factory=Physical)
-
-    def defaults(self) -> dict[str, Any]:
-        """Return `lidar`, and `relief`: the surface that it sees; None for that of the tunnel."""
-        return {**super().defaults(), "relief": None}
 
     def poses(
         self, own: Any, sensing: SensingState, params: EnvParams

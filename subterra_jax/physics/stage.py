@@ -10,7 +10,6 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from jaxtyping import Float
 
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.host.rover import GROUND, LOW_WALL, RAIL, ROLL
@@ -156,26 +155,20 @@ def tunnel_world(plan: TunnelPlan, track: Track, lining: str | None = None) -> m
     spec = mujoco.MjSpec()
     add_ground(spec, track, 1.0 + float(plan.half_width.max()))
     segments = plan.lining(lining or plan.default_lining).segments
-    floor = np.interp(_stations(plan, segments), plan.station, plan.elevation)
     ends = segments.reshape(-1, 2, 2)
     chord = ends[:, 1] - ends[:, 0]
     size = np.linalg.norm(chord, axis=1)
     for k in np.flatnonzero(size > 1e-6):
         across = np.array([-chord[k, 1], chord[k, 0]]) / size[k]
         middle = ends[k].mean(axis=0)
-        nearest = plan.centre[np.argmin(np.sum((plan.centre - middle) ** 2, axis=1))]
-        outward = across if across @ (middle - nearest) > 0.0 else -across
-        centre = [*(middle + 0.5 * _THICK * outward), floor[k] + 0.5 * (_WALL[1] - _WALL[0])]
+        nearest = int(np.argmin(np.sum((plan.centre - middle) ** 2, axis=1)))
+        outward = across if across @ (middle - plan.centre[nearest]) > 0.0 else -across
+        centre = [*(middle + 0.5 * _THICK * outward), plan.elevation[nearest] + 0.5 * (_WALL[1] - _WALL[0])]
         half_turn = 0.5 * np.arctan2(chord[k, 1], chord[k, 0])
         half = (0.5 * size[k], 0.5 * _THICK, 0.5 * sum(_WALL))
         turn = np.array([np.cos(half_turn), 0.0, 0.0, np.sin(half_turn)])
         _add_box(spec, half, np.array(centre), turn, LOW_WALL, (0.7, 0.7, 0.7, 0.3))
     return spec
-
-
-def _stations(plan: TunnelPlan, segments: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n"]:
-    middle = 0.5 * (segments[:, :2] + segments[:, 2:])
-    return plan.station[[int(np.argmin(np.sum((plan.centre - point) ** 2, axis=1))) for point in middle]]
 
 
 def add_ground(spec: mujoco.MjSpec, track: Track, half_width: float, start: float = 0.0, end: float = np.inf) -> None:
