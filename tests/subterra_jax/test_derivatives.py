@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from itertools import product
 
 import jax
 import jax.numpy as jnp
@@ -100,9 +101,10 @@ def ends(env, action, states, noises, params):
 def relative_errors(task: str, n: int, n_steps: int) -> tuple[np.ndarray, np.ndarray]:
     """Derivatives by both numbers of an action against central differences of 64 bits: errors, and where to trust them.
 
-    Away from edges: the episode does not end, and differences of two sizes agree to a tenth of a percent for both
-    numbers, so that no beam passes from one wall to another and nothing is clipped in between. The larger one moves the
-    robot further than 32 bits round, which may bring a beam near an edge to another wall than 64 bits do.
+    Away from edges: the episode does not end, and differences of two sizes, and those at starts 0.1 mm to each side,
+    agree to a tenth of a percent for both numbers, so that no beam passes from one wall to another and nothing is
+    clipped in between. In 20 steps at 600 m 32 bits round a position by about as much: a beam that grazes a far wall
+    then has a derivative that differs by percents, and one near an edge may meet another wall than in 64 bits.
 
     Returns:
         Relative errors `(n, 2)`, and whether a state is away from edges `(n,)`.
@@ -130,17 +132,20 @@ def relative_errors(task: str, n: int, n_steps: int) -> tuple[np.ndarray, np.nda
         )
         measure = jax.jit(jax.vmap(functools.partial(value, env), every))
 
-        def differences(step: float) -> np.ndarray:
-            columns = []
+        def differences(step: float, aside: tuple[float, ...] = (0.0, 0.0)) -> np.ndarray:
+            columns, start = [], args[1].replace(position=args[1].position + 1e-4 * np.array(aside))
             for moved in step * np.eye(2):
-                above, below = (measure(args[0] + sign * moved, *args[1:]) for sign in (1.0, -1.0))
+                above, below = (measure(args[0] + sign * moved, start, *args[2:]) for sign in (1.0, -1.0))
                 assert above.dtype == np.float64
                 columns.append((above - below) / (2.0 * step))
             return np.stack(columns, axis=1)
 
-        fine, coarse = (differences(step) for step in ((1e-5, 1e-3) if n_steps < 20 else (1e-7, 1e-4)))
+        small, large = (1e-5, 1e-3) if n_steps < 20 else (1e-7, 1e-4)
+        fine = differences(small)
+        others = [differences(large), *(differences(small, corner) for corner in product((-1.0, 1.0), repeat=2))]
     size = np.maximum(np.abs(fine), 1e-3)
-    return np.abs(slopes - fine) / size, np.all(np.abs(coarse - fine) < 1e-3 * size, axis=1) & ~ended
+    agree = np.all([np.abs(other - fine) < 1e-3 * size for other in others], axis=(0, 2))
+    return np.abs(slopes - fine) / size, agree & ~ended
 
 
 @pytest.mark.parametrize(
@@ -158,4 +163,4 @@ def test_derivatives_agree_with_central_differences(task, n, n_steps):
     errors, trusted = relative_errors(task, n, n_steps)
     assert trusted.sum() >= min(n // 2, 1000), trusted.mean()
     print(task, n_steps, trusted.sum(), errors[trusted].max(axis=0))
-    assert errors[trusted].max() < 0.01
+    assert errors[trusted].max() < 0.005

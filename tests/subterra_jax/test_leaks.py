@@ -90,10 +90,9 @@ def test_on_the_control_tunnel_nobody_beats_fused_dead_reckoning_by_three_points
     env, params = st.make("Subterra/StopAt-v1", tunnel="control", lining="smooth")
     bound = floor(params)
     agent = make_agent(name, params)
-    success = evaluate(env, params, agent, listed_episodes(env, params)).success.mean()
+    success = evaluate(env, params, agent, listed_episodes(env, params, N)).success.mean()
     print(f"{name}: {100 * success:.1f} %, bound {100 * bound:.1f} %")
-    # Three points, and the error of 500 episodes.
-    assert success <= bound + 0.03 + three_errors(bound, 500)
+    assert success <= bound + 0.03 + three_errors(bound)
 
 
 @pytest.mark.slow

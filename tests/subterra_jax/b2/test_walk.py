@@ -67,17 +67,6 @@ def test_terms_of_the_reward_sum_to_the_reward_and_the_info_has_the_contract_s_k
     assert {"coverage", "station", "lateral", "contact", "success", "fall", "final_observation"} <= info.keys()
 
 
-def test_the_same_key_gives_the_same_step_and_another_one_another(walking):
-    first, state = walking.reset(2)
-    again, _ = walking.reset(2)
-    other, _ = walking.reset(3)
-    np.testing.assert_array_equal(first, again)
-    assert not np.allclose(first, other)
-    one, two, three = (walking.step(seed, state)[0] for seed in (5, 5, 6))
-    np.testing.assert_array_equal(one, two)
-    assert not np.allclose(one, three)
-
-
 def test_the_observation_has_the_size_and_the_parts_it_claims(walking):
     obs, _ = walking.reset(4)
     assert obs.shape == (N_ROBOTS, walking.env.observation_size(walking.params))
