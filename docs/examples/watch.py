@@ -22,7 +22,7 @@ from subterra_jax.tunnel_env import TunnelEnv
 
 GOAL = 0.9
 N_FRESH, FIRST_FRESH = 100, 10_000  # episodes of a score while training, and their first seed
-TURN = 0.2  # fraction of the yaw rate that eased actions reach
+TURN = 0.1  # fraction of the yaw rate that eased actions reach
 _BATCH = 500
 
 
