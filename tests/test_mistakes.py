@@ -157,6 +157,7 @@ MISTAKES = {
     "subterra_jax.viewer --sensor radar": "no sensor 'radar'; there are planar16",
     "subterra_jax.viewer --tunel metro": "nothing is named --tunel; --tunnel is",
     "benchmarks.fidelity rnu": "nothing is named rnu; run is",
+    "subterra_jax trian": "nothing is named trian; train is",
     "scene.build --trajectry=a.tum": "nothing is named --trajectry; --trajectory is",  # before what is missing
     "subterra_jax tasks --tunel x": "unrecognized arguments: --tunel x",
     "subterra_jax.viewer --scene nowhere": "nowhere: no such scene folder",

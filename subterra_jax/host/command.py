@@ -172,6 +172,7 @@ def _misspelt(read: Callable[[list[str]], object], words: list[str]) -> str:
     options = re.findall(r"(?<!\S)(--[a-z][\w.-]*)", page.getvalue())
     usage = page.getvalue().partition("\n\n")[0]
     commands = [name for names in re.findall(r"\{([\w,-]+)\}", usage) for name in names.split(",")]
+    commands += re.findall(r"(?m)^  ([a-z-]+) {2}", page.getvalue())
     for word in words:
         name = word.partition("=")[0].replace("_", "-")
         known = options if word.startswith("--") else commands if [word] == lead[:1] else []
