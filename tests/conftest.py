@@ -33,7 +33,7 @@ def _kept_programs() -> Path:
 
 # Before jax is imported: XLA reads its flags once, and what a test starts inherits them.
 # A flag that an XLA does not know ends the process: the emitters can be left out of jax 0.10 and no longer of 0.12.
-_CHEAP = "--xla_llvm_disable_expensive_passes=true --xla_cpu_parallel_codegen_split_count=2 "  # a sixth less
+_CHEAP = "--xla_llvm_disable_expensive_passes=true --xla_cpu_parallel_codegen_split_count=1 "  # a fifth less
 _LEAVE_OUT = f"{_CHEAP}--xla_cpu_use_fusion_emitters=false " if version("jax").startswith("0.10.") else ""
 os.environ.setdefault("XLA_FLAGS", f"{_LEAVE_OUT}--xla_backend_optimization_level=0")
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # the first process of a run; its workers find it set

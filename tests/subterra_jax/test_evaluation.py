@@ -248,6 +248,12 @@ def test_a_row_of_errors_slides_by_its_share_of_the_way_and_back_again(smooth):
     assert float(mass.sum()) == pytest.approx(1.0, abs=1e-3)
 
 
+def test_the_middle_of_the_heaviest_cluster_is_told_not_the_highest_cell():
+    mass = jnp.zeros((1, 100)).at[0, 20:30].set(0.06).at[0, 70].set(0.4)
+    station, _, way = histogram.summarise(mass, jnp.arange(100.0)[None], jnp.float32(10.0), 1.0)
+    assert (float(station), way) == (pytest.approx(24.5), 1.0)
+
+
 def test_it_stops_within_centimetres_where_dead_reckoning_misses():
     env, params = st.make("Subterra/StopAtShort-v1", tunnel="subterra-351", estimates=True)
     episodes = listed_episodes(env, params, 2)

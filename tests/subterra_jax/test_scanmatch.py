@@ -23,6 +23,7 @@ from subterra_jax.baselines.scanmatch import (
     empty_profile,
     mismatch,
     scan_matching,
+    solve_adjustment,
 )
 from subterra_jax.baselines.scanmodel import TunnelPose
 from subterra_jax.baselines.stations import Driven
@@ -60,6 +61,11 @@ def matched(tunnel, wrong, key):
         return add_scan(profile, pose_at(now[0]), now[1], PARAMS), cost
 
     return best_match(jnp.sum(jax.lax.scan(one, profile, (station[N_SEEN:], scans[N_SEEN:]))[1], axis=0), PARAMS)
+
+
+def test_an_offset_is_worth_as_much_as_one_residual_of_its_standard_deviation():
+    change = solve_adjustment(jnp.full((1, 1), 0.1), jnp.zeros(1), jnp.full((1, 1), PARAMS.lateral_sigma**-2), PARAMS)
+    np.testing.assert_allclose(change[:, 0], [-0.05, 0.0, 0.0], atol=1e-6)
 
 
 @pytest.fixture(scope="module")
