@@ -15,7 +15,7 @@ JUNK = bytes(range(256)) * 8
 # Command line → what its sentence must say. `text.txt` is a file, `empty` a folder, `junk.*` are bytes of no kind,
 # `tunnel` is a scene folder of such bytes, /proc a folder in which nobody can write.
 MISTAKES = {
-    "subterra_jax tain": "invalid choice: 'tain'",
+    "subterra_jax tain": "nothing is named tain; train is",
     "scene.limits moon": "no part 'moon' with thresholds; there are cleaning.",
     "scene.survey": "missing: --out",
     "scene.survey --out text.txt": "text.txt",
@@ -154,7 +154,6 @@ MISTAKES = {
     "subterra_jax.viewer --sensor radar": "no sensor 'radar'; there are planar16",
     "subterra_jax.viewer --tunel metro": "nothing is named --tunel; --tunnel is",
     "benchmarks.fidelity rnu": "nothing is named rnu; run is",
-    "subterra_jax trian": "nothing is named trian; train is",
     "scene.build --trajectry=a.tum": "nothing is named --trajectry; --trajectory is",  # before what is missing
     "subterra_jax tasks --tunel x": "unrecognized arguments: --tunel x",
     "subterra_jax.viewer --scene nowhere": "nowhere: no such scene folder",

@@ -167,8 +167,10 @@ def _misspelt(read: Callable[[list[str]], object], words: list[str]) -> str:
     """Returns a sentence about the first word that names no option or command, with the nearest name that does."""
     lead = list(takewhile(lambda word: not word.startswith("-"), words))
     page = io.StringIO()
-    with suppress(SystemExit), redirect_stdout(page), redirect_stderr(io.StringIO()):
-        read([*lead, "--help"])
+    for before in (lead, []):  # a wrong command may have no help of its own
+        with suppress(SystemExit), redirect_stdout(page), redirect_stderr(io.StringIO()):
+            if not page.getvalue():
+                read([*before, "--help"])
     options = re.findall(r"(?<!\S)(--[a-z][\w.-]*)", page.getvalue())
     usage = page.getvalue().partition("\n\n")[0]
     commands = [name for names in re.findall(r"\{([\w,-]+)\}", usage) for name in names.split(",")]
