@@ -120,7 +120,9 @@ class AutoReset:
             needed = twice(jnp.ones_like(done), done)
             observe = jax.vmap(self.env.observe, in_axes=(0, 0, self.params_axes, 0))
             obs, final = jnp.split(observe(both_states, both_noises, both_params, needed), 2)
-            return obs, jnp.where(done[:, None], final, obs)
+            # Each is computed once, and the second alone where someone reads it.
+            obs = jax.lax.optimization_barrier(obs)
+            return obs, jax.lax.optimization_barrier(jnp.where(done[:, None], final, obs))
         obs = self._vmap(self.env.observe, 2)(merged, noise, params)
 
         def again(pick: Callable[[Any], Any]) -> Obs:

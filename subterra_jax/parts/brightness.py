@@ -7,9 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from subterra_jax import constants
-from subterra_jax.host.texture import brightness, wall_angle
-from subterra_jax.tunnel import Tunnel, at_station, node_at
+from subterra_jax.tunnel import Tunnel, node_at
 
 FULL_SCALE, SCALE_SIGMA = 150.0, 0.05  # reported for 100 % diffuse, as Livox scales it; relative noise
 MOST = 255.0
@@ -17,36 +15,33 @@ DOPPLER_SIGMA = 0.03  # m/s. Source: Aeva's Aeries II, 3 cm/s
 DOPPLER_MOST = 20.0  # m/s
 
 
-def wall_brightness(
-    tunnel: Tunnel,
-    station: Float[Array, ""],
-    position: Float[Array, "2"],
-    ends: Float[Array, "n d"],
-    texture: Float[Array, ""] | float | None,
-) -> tuple[Float[Array, "n"] | float, Float[Array, "n 2"]]:
-    """Return factors on the reflectivity of the lining where beams end, and the tangent of the axis there.
+def place_ends(
+    tunnel: Tunnel, station: Float[Array, ""], position: Float[Array, "2"], x: Float[Array, "n"], y: Float[Array, "n"]
+) -> tuple[Array, ...]:
+    """Find the ends of beams by the axis of the tunnel.
+
+    Nothing is stacked, nor are rows of the grid read as a whole: a GPU would write all of it to its memory. Pairs of
+    numbers are read as one.
 
     Args:
         station: Station of the sensor, m.
         position: Its position in plan, tunnel frame, m.
-        ends: Ends of the beams, tunnel frame, m; in plan those of a planar LiDAR.
-        texture: Dial, 0 to 1; `None` is 0.
+        x: Ends of the beams in plan, tunnel frame, m.
+        y: Likewise.
+
+    Returns:
+        Of each beam the nearest row of `grid`, the distance ahead of it (m), that to the left of the axis (m), the
+        station (m), and the unit tangent x, y of the axis there.
     """
-    _, _, tangent_x, tangent_y, _ = at_station(tunnel, station)
-    near = station + (ends[:, 0] - position[0]) * tangent_x + (ends[:, 1] - position[1]) * tangent_y
+    middle, tangent = (jax.lax.complex(tunnel.grid[:, k], tunnel.grid[:, k + 1]) for k in (0, 2))
+    ahead = tangent[node_at(tunnel, station)]
+    near = station + (x - position[0]) * jnp.real(ahead) + (y - position[1]) * jnp.imag(ahead)
     node = jax.vmap(node_at, (None, 0))(tunnel, near)
-    row = tunnel.grid[node]
-    away, tangent = ends[:, :2] - row[:, :2], row[:, 2:4]
-    if texture is None:
-        return 1.0, tangent
-    ahead = away[:, 0] * tangent[:, 0] + away[:, 1] * tangent[:, 1]
-    left = tangent[:, 0] * away[:, 1] - tangent[:, 1] * away[:, 0]
-    above: Any = constants.SPATIAL_HEIGHT
-    if ends.shape[1] == 3:
-        ground = tunnel.space.ground[node]
-        above = ends[:, 2] - ground[:, 0] - ground[:, 1] * ahead
+    x, y = x - jnp.real(middle[node]), y - jnp.imag(middle[node])
+    tangent_x, tangent_y = jnp.real(tangent[node]), jnp.imag(tangent[node])
+    ahead, left = x * tangent_x + y * tangent_y, tangent_x * y - tangent_y * x
     at = tunnel.spacing * (node - tunnel.first_node).astype(ahead.dtype) + ahead
-    return brightness(jnp, at, wall_angle(jnp, left, above), tunnel.texture, texture), tangent
+    return node, ahead, left, at, tangent_x, tangent_y
 
 
 def normal_beside(normal: Float[Array, "n"], channel: int) -> Float[Array, "n"]:

@@ -8,8 +8,10 @@ import numpy as np
 from jaxtyping import Array
 
 from subterra_jax import lidar
+from subterra_jax.constants import SPATIAL_HEIGHT
+from subterra_jax.host.texture import brightness, wall_angle
 from subterra_jax.lidar3d import echo
-from subterra_jax.parts.brightness import MOST, intensity, normal_beside, wall_brightness
+from subterra_jax.parts.brightness import MOST, intensity, normal_beside, place_ends
 from subterra_jax.parts.part import Bounds, Noise, Part, SensingState
 from subterra_jax.state import EnvParams
 
@@ -34,11 +36,13 @@ class PlanarLidar(Part):
         ranges = sensing.corrupt(jnp.minimum(walls, things))
         entries = {"ranges": lidar.add_noise(ranges, noise.normal, params.lidar)}
         if params.lidar.intensity:
-            ends = sensing.position + walls[:, None] * directions
-            factor, tangent = wall_brightness(
-                sensing.tunnel, sensing.station, sensing.position, ends, params.lidar.texture
-            )
-            slant = jnp.abs(tangent[:, 0] * directions[:, 1] - tangent[:, 1] * directions[:, 0])
+            tunnel, x, y = sensing.tunnel, directions[:, 0], directions[:, 1]
+            ends = sensing.position[0] + walls * x, sensing.position[1] + walls * y
+            *_, left, at, tangent_x, tangent_y = place_ends(tunnel, sensing.station, sensing.position, *ends)
+            slant, factor = jnp.abs(tangent_x * y - tangent_y * x), 1.0
+            if params.lidar.texture is not None:
+                angle = wall_angle(jnp, left, SPATIAL_HEIGHT)
+                factor = brightness(jnp, at, angle, tunnel.texture, params.lidar.texture)
             met = things < walls
             reflectivity = jnp.where(met, echo.ALBEDO_THING, echo.ALBEDO_LINING * factor)
             shown = intensity(jnp.where(met, 1.0, slant), reflectivity, normal_beside(noise.normal, 1))

@@ -9,6 +9,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
+from subterra_jax.host.texture import brightness, wall_angle
 from subterra_jax.lidar3d import beams, echo
 from subterra_jax.lidar3d.casting import Met, meet, require_free, require_pattern
 from subterra_jax.lidar3d.echo import EchoParams
@@ -21,7 +22,7 @@ from subterra_jax.parts.brightness import (
     MOST,
     intensity,
     normal_beside,
-    wall_brightness,
+    place_ends,
 )
 from subterra_jax.parts.part import Bounds, Noise, Part, SensingState, Step
 from subterra_jax.parts.unicycle import wrap
@@ -279,7 +280,11 @@ class SpatialLidar(Part):
         reflectivity = echo.albedo(met.normal[:, 2], met.thing, rays[:, 2] < 0.0)
         if sensor.texture is not None:
             ends = origins + met.ranges[:, None] * rays
-            factor, _ = wall_brightness(sensing.tunnel, sensing.station, sensing.position, ends, sensor.texture)
+            tunnel, (x, y, z) = sensing.tunnel, (ends[:, k] for k in range(3))
+            node, ahead, left, at, *_ = place_ends(tunnel, sensing.station, sensing.position, x, y)
+            ground = tunnel.space.ground[node]
+            angle = wall_angle(jnp, left, z - ground[:, 0] - ground[:, 1] * ahead)
+            factor = brightness(jnp, at, angle, tunnel.texture, sensor.texture)
             reflectivity = jnp.where(met.thing, reflectivity, reflectivity * factor)
         if uniform is not None and sensor.echo.losing:
             there &= echo.returns(ranges, cosine, reflectivity, uniform[:, 0], sensor.echo)

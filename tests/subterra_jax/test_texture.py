@@ -13,6 +13,7 @@ from subterra_jax.baselines.agent import observed
 from subterra_jax.baselines.steering import CentreLine
 from subterra_jax.host.errors import TunnelError
 from subterra_jax.host.texture import RING, brightness, texture_seed, wall_angle
+from subterra_jax.lidar import LidarParams
 from subterra_jax.parts.brightness import normal_beside
 from subterra_jax.policies.locate import bends, strips
 from tests.subterra_jax.placing import observe, placed
@@ -64,17 +65,19 @@ def test_neighbours_are_alike_also_across_the_seam_and_joints_are_dark():
     np.testing.assert_allclose(wall_angle(np, np.array([0.0, 2.0, -2.0]), 1.5), [0.0, np.pi / 2, -np.pi / 2])
 
 
-def test_planar_intensities_are_those_of_the_wall_and_a_pose_moves_none_of_it():
-    env, params = st.make(TASK, tunnel=straight(), intensity=True, texture=1.0)
-    seen = observe(env, placed(env, params, 15.0, 0.4, 0.3), params)
-    assert seen["intensity"].shape == (16,)
-    assert (seen["intensity"] == np.round(seen["intensity"])).all()
-    bearing = 0.3 + 2.0 * np.pi * np.arange(16) / 16
-    reach = np.where(np.sin(bearing) > 0.0, HALF - 0.4, HALF + 0.4) / np.abs(np.sin(bearing))
-    station, left = 15.0 + reach * np.cos(bearing), np.sign(np.sin(bearing)) * HALF
-    factor = brightness(np, station, wall_angle(np, left, np.full(16, 0.7)), texture_seed(straight().name), 1.0)
-    met = (station > 0.5) & (station < 39.5)
-    expected = 150.0 * 0.3 * np.abs(np.sin(bearing)) * factor
+@pytest.mark.parametrize("radius", [1e5, 60.0])
+def test_planar_intensities_are_those_of_the_wall_also_in_a_bend(radius):
+    turn, bearing = np.linspace(0.0, 40.0, 81) / radius, 2.0 * np.pi * np.arange(16) / 16 + 0.3
+    line = radius * np.stack([np.sin(turn), 1.0 - np.cos(turn)], axis=-1)
+    plan = st.tunnel.from_centreline(line, HALF)
+    env, params = st.make(TASK, tunnel=plan, lidar=LidarParams(range_sigma=0.0, intensity=True, texture=1.0))
+    state = placed(env, params, 15.0, 0.4, 0.3).replace(position=jnp.asarray(line[30], jnp.float32))
+    seen = observe(env, state, params)
+    x, y = line[30][:, None] + seen["ranges"] * np.stack([np.cos(bearing), np.sin(bearing)])
+    turned, left = np.arctan2(x, radius - y), radius - np.hypot(x, radius - y)
+    factor = brightness(np, radius * turned, wall_angle(np, left, 0.7), texture_seed(plan.name), 1.0)
+    expected = 150.0 * 0.3 * np.abs(np.sin(bearing - turned)) * factor
+    met = seen["ranges"] < 12.0
     assert (np.abs(seen["intensity"] - expected)[met] < 0.2 * expected[met] + 1.5).all()
     assert np.corrcoef(seen["intensity"][met], expected[met])[0, 1] > 0.97
 
