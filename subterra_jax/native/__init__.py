@@ -1,7 +1,7 @@
 """LiDAR and clearance as machine code for the CPU, where numba is installed (`pip install subterra-jax[cpu]`).
 
-Numba compiles the code at its first use and keeps it on disk. Without numba XLA does the same work in two times (Intel)
-to five times (AMD) the time.
+Numba compiles the code at its first use and keeps it on disk. Without numba a step of 1,024 robots takes three to four
+times as long.
 """
 
 import functools
