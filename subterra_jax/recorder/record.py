@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from subterra_jax.evaluation.episodes import SHA256
+from subterra_jax.host.versions import VERSION
 from subterra_jax.recorder import messages
 from subterra_jax.recorder.config import (
     RecorderConfig,
@@ -89,7 +90,7 @@ def _points(trace: Trace, scans: Float[np.ndarray, "rows m"], sensor: Any, every
 
 
 _RECORDING_SCHEMA, _TRUTH_SCHEMA = "subterra.recording/1", "subterra.recording-truth/1"
-_LIBRARIES = ("subterra-jax", "jax", "numpy", "rosbags")
+_LIBRARIES = ("jax", "numpy", "rosbags")
 
 
 def _recording_facts(config: RecorderConfig, trace: Trace, world: World, topics: dict[str, Any]) -> dict[str, Any]:
@@ -117,7 +118,7 @@ def _recording_facts(config: RecorderConfig, trace: Trace, world: World, topics:
         "sensors": sensors,
         "topics": topics,
         "constants": constants_digest(env, params),
-        "versions": {name: version(name) for name in _LIBRARIES},
+        "versions": {"subterra-jax": VERSION, **{name: version(name) for name in _LIBRARIES}},
     }
 
 
