@@ -25,7 +25,7 @@ doors: $(STAMP)    ## modes of JAX, adapters, policies and training; a part of t
 	$(BIN)/python -m pytest -m 'door and not slow'
 
 AGAIN := out/reproduce
-reproduce: $(STAMP)  ## speed, dirty clouds and cells of the board again, on a CPU in about 25 minutes; says what differs from the records
+reproduce: $(STAMP)  ## speed, dirty clouds and cells of the board again, on a CPU in about 10 minutes; says what differs from the records
 	$(BIN)/python -m benchmarks.throughput --n 1 1024 --peers none --poses 200000 --out $(AGAIN)/speed
 	test ! -e $(SHARED)/data/dirty_clouds || $(BIN)/python -m benchmarks.dirty $(SHARED)/data/dirty_clouds --out $(AGAIN)/dirty
 	$(BIN)/python -m benchmarks.board --tasks StopAt --start given --splits test-unseen --agents dead-reckoning fused scan-matching --out $(AGAIN)/board
