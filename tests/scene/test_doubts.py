@@ -57,12 +57,9 @@ def test_sizes_of_no_tunnel_name_the_unit_that_would_make_one(bore, by, said):
     assert re.search(said, codes(scaled(bore, by))["size"])
 
 
-def test_a_cm_cloud_taken_as_mm_is_told_by_its_size(bore):
+def test_a_cm_cloud_taken_as_mm_is_told_by_its_size_and_a_size_that_the_user_told_is_not_doubted(bore):
     outcome = codes(scaled(bore, 0.1), {"unit": "mm (detected: least extent 550)"})["size"]
     assert "--unit cm makes it 5.6 m by 6 m" in outcome
-
-
-def test_a_size_that_the_user_told_is_not_doubted(bore):
     assert codes(scaled(bore, 2.2), {"unit": "m (by flag)"}) == {}
 
 

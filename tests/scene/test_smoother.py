@@ -5,15 +5,17 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from scene.errors import FitError, Refusal
+from scene.poses import imu
 from scene.poses.imu import GRAVITY, Inertial, integrals
 from scene.poses.smoother import Noise, find_control_lag, inertial_problem, means_between, solve_with_heading
-from scene.poses.terms import KNOT_SIZE, Chain, Motion, NormalEquations, Sightings, Steps, add_motion
+from scene.poses.terms import KNOT_SIZE, Chain, Motion, NormalEquations, Sightings, Steps, add_biases, add_motion
 from scene.poses.trajectory import Control
 from tests.scene import walks
 
@@ -71,11 +73,13 @@ def test_samples_are_integrated_by_the_trapezium_rule():
 
 
 class Recorder:
-    """Keeps what a term adds."""
+    """Keeps what terms add: residuals, and by knots the jacobians."""
 
-    def add(self, residual, first, jacobian_first, second, jacobian_second):
-        self.residual, self.first, self.second = residual, first, second
-        self.jacobians = jacobian_first, jacobian_second
+    def __init__(self):
+        self.terms = []
+
+    def add(self, residual, *parts):
+        self.terms.append((residual, zip(parts[::2], parts[1::2], strict=True)))
 
 
 def small_chain() -> Chain:
@@ -98,23 +102,24 @@ def terms():
         "motion": lambda sink, at: add_motion(sink, at, motion, 1.0),
         "sightings": lambda sink, at: seen.add_to(sink, at, 1e9),
         "steps": lambda sink, at: steps.add_to(sink, at, 1e9),
+        "biases": lambda sink, at: add_biases(sink, at, (0.5, 0.4), (0.3, 0.2)),
     }
 
 
-@pytest.mark.parametrize("name", ["motion", "sightings", "steps"])
+@pytest.mark.parametrize("name", ["motion", "sightings", "steps", "biases"])
 def test_written_out_derivatives_agree_with_finite_differences(name):
     add, chain, h = terms()[name], small_chain(), 1e-6
-    here, moved = Recorder(), Recorder()
+    here = Recorder()
     add(here, chain)
-    for unknown in range(KNOT_SIZE):
-        for which, jacobian in zip((here.first, here.second), here.jacobians, strict=True):
-            for term, knot in enumerate(which):
-                step = np.zeros((4, KNOT_SIZE))
+    for number, (residual, parts) in enumerate(here.terms):
+        for term, knot, jacobian in ((k, *one) for part in parts for k, one in enumerate(zip(*part, strict=True))):
+            for unknown in range(KNOT_SIZE):
+                step, moved = np.zeros((4, KNOT_SIZE)), Recorder()
                 step[knot, unknown] = h
                 add(moved, chain.after(step))
-                slope = (moved.residual[term] - here.residual[term]) / h
+                slope = (moved.terms[number][0][term] - residual[term]) / h
                 # The turn half way, and the half turn of the force, are linearised to first order in a small angle.
-                np.testing.assert_allclose(slope, jacobian[term][:, unknown], atol=0.02)
+                np.testing.assert_allclose(slope, jacobian[:, unknown], atol=0.02)
 
 
 def test_the_banded_solution_is_the_dense_one():
@@ -138,6 +143,14 @@ def test_what_nothing_determines_is_an_error():
     with pytest.raises(FitError) as raised:
         equations.solve()
     assert raised.value.code is Refusal.POSES
+
+
+def test_the_imu_in_the_housing_of_a_lidar_levels_it(monkeypatch):
+    own = Inertial(np.arange(2.0), np.zeros((2, 3)), np.full((2, 3), [3.0, 0.0, 9.3]), "/livox/imu")
+    monkeypatch.setattr(imu, "imu_topics", lambda _: ["/imu/data", own.topic])
+    monkeypatch.setattr(imu, "read_inertial", lambda _, topic: own if topic == own.topic else None)
+    turn = imu.level_rotation(SimpleNamespace(topic="/livox/lidar"), None, None, None)
+    np.testing.assert_allclose(turn.apply(own.force[0])[:2], 0.0, atol=1e-9)
 
 
 ROOT = Path(__file__).parents[2]

@@ -46,12 +46,9 @@ def case() -> Case:
     return tube.case(sigma=0.02, beams=40_000, spacing=4.0)  # dense, so that patches are flat
 
 
-def test_a_clean_split_has_no_leak(case: Case) -> None:
+def test_a_clean_split_has_no_leak_nor_has_nothing_held_out(case: Case) -> None:
     other = tube.hold(tube.Tube(), sigma=0.02, beams=40_000, spacing=4.0, seed=1)
     assert leaks.find_leaks(replace(case, fit=other, cache={}), GOOD, case.hold.hash) == []
-
-
-def test_nothing_held_out_is_no_leak(case: Case) -> None:
     assert leaks.find_leaks(replace(case, hold=None), {}) == []
 
 

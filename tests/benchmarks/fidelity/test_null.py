@@ -77,15 +77,12 @@ def with_slab(scene, group: int):
         path.write_text(text)
 
 
-def test_a_bed_that_the_scene_shows_is_seen(scene) -> None:
+def test_a_bed_that_the_scene_shows_is_seen_and_one_that_only_bodies_touch_is_not(scene) -> None:
     judged = with_slab(scene, 0)
     np.testing.assert_allclose(judged.bed.bounds, [[1, -1.5, -2.1], [5, 1.5, -1.9]], atol=1e-6)
     assert len(visible_mesh(judged).faces) == len(visible_mesh(load_candidate(scene)).faces) + 12
     assert len(null_tube(judged).bed.faces) == 12
     assert not len(null_tube(judged, sleepers=False).bed.faces)
-
-
-def test_a_bed_that_only_bodies_touch_is_not(scene) -> None:
     assert not len(with_slab(scene, 3).bed.faces)
 
 

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from benchmarks.fidelity import table
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.categories import sensor
+from benchmarks.fidelity.derive import distances
 from benchmarks.fidelity.derive.beams import cast_beams, returns, sensor_path
 from benchmarks.fidelity.derive.clouds import fit_planes, mean_entropy, voxel_map, voxel_wasserstein
 from benchmarks.fidelity.derive.degeneracy import alias_ratios, information, localised_stations
@@ -248,3 +249,9 @@ def test_half_of_the_beams_agree_as_well(id):
     half = put_in(Site(judged(), np.random.default_rng(7)), Fault("thinned", 0.5))
     assert raw("vox_iou_20cm", half) < raw("vox_iou_20cm", judged()) - 0.02
     assert raw(id, half) == pytest.approx(raw(id, judged()), abs=0.005)
+
+
+def test_a_single_point_tells_two_clouds_apart_where_the_other_has_none_beside_it():
+    one, none = np.array([1, 0, 0]), np.zeros(3, int)
+    assert [distances.cells_apart(*pair).tolist() for pair in ((one, none), (none, one))] == [[True, False, False]] * 2
+    assert not distances.cells_apart(one, np.roll(one, 1)).any()

@@ -75,9 +75,7 @@ def test_where_the_recording_shows_no_track_there_is_nothing_to_match():
     for id in ("trk_sleeper_f1", "trk_gauge_mean_err", "trk_rail_lateral_rmse"):
         assert measure(id, bare).value is None
         assert not measure(id, bare).failed
-
-
-def test_sleepers_that_the_truth_has_not_match_nothing():
+    # Sleepers that the truth has not match nothing.
     assert measure("trk_sleeper_f1", tube.case(replace(SHORT, track=False), SHORT)).value == 0.0
 
 

@@ -48,6 +48,7 @@ def test_diagonal_legs_step_together():
         assert float(on[0]) == float(on[3])
         assert float(on[1]) == float(on[2])
         assert float(on[0] + on[1]) >= 0.9
+    assert all(float(follow(0.6 * way, 0.3)[-1].stride) == 1.0 for way in np.eye(3))
 
 
 def test_a_foot_on_the_ground_goes_back_as_fast_as_the_robot_is_to_go_forward():

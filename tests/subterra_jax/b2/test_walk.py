@@ -35,10 +35,7 @@ def test_under_no_command_the_zero_action_stands_on_sleepers(walking):
 
 
 def test_the_zero_action_walks_over_sleepers_at_three_quarters_of_what_is_asked(walking):
-    """The trot without its policy, of 0.6 m/s: 0.45 on the track of today and on the one before alike (eight robots).
-
-    One in six stumbles and has half of it, on either track; the policy makes up for what is missing, see `test_policy`.
-    """
+    """The trot without its policy; one in six stumbles and has half of it, see `test_policy`."""
     state, outcome = run(walking, 4.0, walking.commanded((0.6, 0.0, 0.0)))
     assert not outcome["terminated"].any()
     speed = (outcome["station"][-1] - outcome["station"][99]) * np.asarray(state.facing) / 2.0
