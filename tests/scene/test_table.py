@@ -148,8 +148,8 @@ def test_a_row_of_the_table_ends_as_it_should(name, request, tmp_path, monkeypat
     assert row.said in said.out + said.err
     assert out.exists() == (row.status == 0)
     if row.status == 2:
-        assert said.err.startswith("error: ")
-        assert said.err.count("\n") == 1
+        (line,) = (line for line in said.err.splitlines() if not line.endswith(" left"))  # progress of a slow machine
+        assert line.startswith("error: ")
     else:
         manifest = json.loads((out / "manifest.json").read_text())
         assert row.facts.items() <= manifest["detected"].items()
