@@ -85,8 +85,7 @@ def _run(page: Path, blocks: list[re.Match[str]]) -> None:
     """Runs blocks one after another, as somebody does who pastes them into one session; a score is above 0."""
     names: dict[str, Any] = {"__name__": "__main__"}
     for block in blocks:
-        lines_before = block.string[: block.start(1)].count("\n")
-        exec(compile("\n" * lines_before + block[1], str(page), "exec"), names)
+        exec(compile("\n" * block.string.count("\n", 0, block.start(1)) + block[1], str(page), "exec"), names)
     assert names.get("scores", {"success": 1.0})["success"] > 0.0
 
 
