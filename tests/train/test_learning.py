@@ -180,12 +180,9 @@ def test_a_policy_that_is_not_to_be_kept_gives_way_to_a_later_one_that_does_wors
     assert Best.of(best, full_window(0.1, 1.0), 2, named("later"), keep=False).policy.network == "later"
 
 
-def test_a_window_without_episodes_has_no_mean():
-    assert EpisodeWindow().mean("coverage") is None
-
-
 def test_a_window_survives_json_exactly():
     window = EpisodeWindow()
+    assert window.mean("coverage") is None  # without episodes
     add(window, random_unroll(np.random.default_rng(1)), step=0)
     again = EpisodeWindow.from_json(json.loads(json.dumps(window.to_json())))
     assert again.count == window.count

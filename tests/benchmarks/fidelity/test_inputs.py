@@ -26,12 +26,9 @@ from tests.benchmarks.fidelity import tube
 from tests.scene.bags import write_bag
 
 
-def test_a_recording_without_poses_is_refused(tmp_path: Path) -> None:
+def test_a_recording_without_poses_and_references_without_a_scene_are_refused(tmp_path: Path) -> None:
     with pytest.raises(FidelityError, match="--recording and --trajectory go together"):
         complete_inputs(Inputs(scene=tmp_path, recording=tmp_path))
-
-
-def test_references_without_a_scene_are_refused(tmp_path: Path) -> None:
     with pytest.raises(FidelityError, match="need --scene"):
         complete_inputs(Inputs(truth=tmp_path))
 
