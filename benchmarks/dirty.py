@@ -369,11 +369,8 @@ def _number(row: dict[str, Any], name: str, digits: int = 1) -> str:
 def records_of(rows: list[dict[str, Any]]) -> list[Record]:
     """Returns the worst figures of all clouds as records; a cloud that was refused has none."""
     found, command = [], "benchmarks.dirty {shared}/data/dirty_clouds --out out/dirty"
-    for id, name, worst, unit in (
-        ("wall-mean", "wall_mean", max, "cm"), ("wall-within-10-cm", "wall_near", min, "%"),
-        ("width", "width", max, "cm"), ("floor-worst", "floor_worst", max, "cm"),
-    ):  # fmt: skip
-        values = [abs(row[name]) for row in rows if not math.isnan(row.get(name, math.nan))]
+    for id, name, worst, unit in (("wall-mean", "wall_mean", max, "cm"), ("wall-within-10-cm", "wall_near", min, "%")):
+        values = [row[name] for row in rows if name in row]
         if values:
             worst_of_all = round(100.0 * worst(values), 2)
             found.append(measured(f"dirty/{id}", worst_of_all, unit, command, n=len(values), split="clouds"))
