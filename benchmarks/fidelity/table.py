@@ -95,9 +95,9 @@ class Metric:
         return self.role in "SG"
 
     def as_row(self) -> dict[str, Any]:
-        """Return everything that a verdict depends on, as plain data."""
+        """Return everything that a verdict depends on, as plain data; words for people are no part of it."""
         plain = asdict(replace(self, compute=str, of=None))
-        return {key: value for key, value in plain.items() if key not in ("compute", "of")}
+        return {key: value for key, value in plain.items() if key not in ("definition", "compute", "of")}
 
 
 _METRICS: dict[str, Metric] = {}
