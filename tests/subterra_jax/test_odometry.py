@@ -7,6 +7,7 @@ import pytest
 
 import subterra_jax as st
 from benchmarks import reference
+from subterra_jax.baselines import stations
 from subterra_jax.parts import odometer as odometry
 from subterra_jax.parts import slip
 from subterra_jax.parts import unicycle as vehicle
@@ -84,6 +85,8 @@ def test_the_size_of_the_steps_does_not_matter_to_a_wandering_error():
         many = slip.advance_wander(many, jnp.float32(-3.0), jnp.float32(0.0), PARAMS)
     np.testing.assert_allclose(many, one, rtol=1e-5)
     assert slip.advance_wander(jnp.float32(0.02), jnp.float32(0.0), jnp.float32(5.0), PARAMS) == jnp.float32(0.02)
+    # As the filters have it: after a long way nothing is left of it, and its size is what it was.
+    np.testing.assert_allclose(stations._process(PARAMS, jnp.float32(1e6)), [0.0, 4e-4], rtol=1e-6)
 
 
 def test_slips_have_the_stated_spread_and_each_a_draw_of_its_own():
