@@ -156,7 +156,7 @@ def _from_trunk(points: Float[np.ndarray, "t p 3"], state: State, params: EnvPar
     from subterra_jax.b2.constants import LIDAR  # MuJoCo is loaded only where a robot walks
 
     qpos, heading = state.legs.body.qpos, np.asarray(state.heading, np.float64)
-    lean = Rotation.from_euler("z", -heading) * Rotation.from_quat(qpos[:, [4, 5, 6, 3]])
+    lean = Rotation.from_euler("z", -heading[:, None]) * Rotation.from_quat(qpos[:, [4, 5, 6, 3]])
     height = (qpos[:, 2] + float(params.track.protrusion[0]))[:, None, None]
     return (points + np.array(LIDAR)) @ lean.as_matrix().transpose(0, 2, 1) + height * np.array([0.0, 0.0, 1.0])
 
