@@ -120,8 +120,7 @@ class AutoReset:
             needed = twice(jnp.ones_like(done), done)
             observe = jax.vmap(self.env.observe, in_axes=(0, 0, self.params_axes, 0))
             obs, final = jnp.split(observe(both_states, both_noises, both_params, needed), 2)
-            # Each is computed once, and the second alone where someone reads it.
-            obs = jax.lax.optimization_barrier(obs)
+            # A barrier of its own: whoever does not read it does not pay for it.
             return obs, jax.lax.optimization_barrier(jnp.where(done[:, None], final, obs))
         obs = self._vmap(self.env.observe, 2)(merged, noise, params)
 
