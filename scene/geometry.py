@@ -123,7 +123,7 @@ def axis_through(points: Float[np.ndarray, "n 3"], spacing: float) -> Axis:
 N_ANGLES = 360
 _HEIGHT_STEP = 0.05
 _CHORD_WINDOW = 0.4
-# Chords this close to the longest fraction in the middle, so that noise on one of them does not move it.
+# Chords this close to the longest share in the middle, so that noise on one of them does not move it.
 _LONG_CHORD = 0.97
 
 

@@ -99,7 +99,7 @@ class TrainConfig:
     stop_coverage: float = 2.0
     stop_patience: int = 40  # for how many iterations in a row that must hold
     checkpoint_every: int = 50  # iterations between checkpoints; one is written at the end in any case
-    # Parts that the environments are split into, each with draws of its own. As many devices as divide them fraction
+    # Parts that the environments are split into, each with draws of its own. As many devices as divide them share
     # them out; the result does not depend on how many those are.
     parts: int = 1
     # `ordered`: one seed gives one result on a GPU as well. `any`: a GPU adds up in any order.

@@ -63,7 +63,7 @@ class SubterraVecEnv(VecEnv):
         return self._envs.render() or [None] * self.num_envs
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """Return an attribute of `SubterraVectorEnv`, which all environments fraction."""
+        """Return an attribute of `SubterraVectorEnv`, which all environments share."""
         return [getattr(self._envs, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:

@@ -241,7 +241,7 @@ def _following(
     """Return the keys of the boxes that each beam enters next after the `last`, nearest first; then `_NOTHING`.
 
     With m the middle of a box and e its half axis, both from the LiDAR, a line along d crosses the box if
-    |d × m| ≤ |d × e| + thickness, and does so at the distance (m × e) / (d × e), whose numerator all beams fraction.
+    |d × m| ≤ |d × e| + thickness, and does so at the distance (m × e) / (d × e), whose numerator all beams share.
     """
     n_beams, n_bits = direction.shape[0], (tunnel.n_scan - 1).bit_length()
     # Opposite beams share a line, and so everything but its sense.

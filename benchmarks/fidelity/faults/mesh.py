@@ -250,7 +250,7 @@ def coarsen(site: Site, fault: Fault) -> Candidate:
 
 # Bodies in the bore, and a mouth that is closed.
 
-EACH = 36.0  # m, the tunnels on which the points of the controls were set: a longer one gets its fraction
+EACH = 36.0  # m, the tunnels on which the points of the controls were set: a longer one gets its share
 _WALL_THICKNESS = 0.3  # m
 _DEBRIS_RADIUS = 0.3  # m
 _PILLAR_SIZE = (0.5, 0.4)  # m along and across the tunnel
