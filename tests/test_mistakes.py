@@ -1,6 +1,7 @@
 """Mistakes of a user at a command line: one sentence, exit status 2, nothing half-written."""
 
 import os
+import re
 import runpy
 import shlex
 import subprocess
@@ -227,6 +228,7 @@ def test_help_fits_a_screen_and_has_an_example(command, desk, monkeypatch, capsy
     assert run([*words, "--help"], monkeypatch) == 0
     page = capsys.readouterr().out
     assert page.count("\n") <= 45
+    assert not re.findall(r"(?m)^  --\S+(?: [^a-z\s]\S*)*\s+\((?:default|required)", page), "an option without a word"
     assert max(map(len, page.splitlines())) <= 100
     assert f"python -m {command} " in " ".join(page.split("\n\n", 1)[1].split())
 

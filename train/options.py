@@ -37,7 +37,8 @@ def with_weights(command: C, weights: Any) -> C:
         [("reward", reward, dataclasses.field(default_factory=reward))],
         bases=(type(command),),
         frozen=True,
-        namespace={"__doc__": type(command).__doc__},
+        # By the module tyro finds the comments that are shown as help.
+        namespace={"__doc__": type(command).__doc__, "__module__": type(command).__module__},
     )
     return own(**{field.name: getattr(command, field.name) for field in dataclasses.fields(command)})  # type: ignore
 

@@ -110,6 +110,7 @@ def _recording_facts(config: RecorderConfig, trace: Trace, world: World, topics:
         "provenance": plan.provenance,
         "lining": config.lining or plan.default_lining,
         "agent": config.agent,
+        "motion": config.motion,
         "observed": first,
         "steps": len(trace.command),
         "period": trace.period,
