@@ -1,4 +1,4 @@
-"""What is installed where there is no checkout."""
+"""The installed wheel, where there is no checkout."""
 
 import os
 import subprocess

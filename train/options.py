@@ -32,7 +32,7 @@ def with_weights(command: C, weights: Any) -> C:
     fields = [(field.name, float, float(getattr(weights, field.name))) for field in dataclasses.fields(weights)]
     named = [(name, kind, dataclasses.field(default=value)) for name, kind, value in fields]
     reward = dataclasses.make_dataclass("Reward", named, frozen=True, namespace={"__doc__": type(weights).__doc__})
-    own = dataclasses.make_dataclass(
+    own: Any = dataclasses.make_dataclass(
         type(command).__name__,
         [("reward", reward, dataclasses.field(default_factory=reward))],
         bases=(type(command),),
@@ -40,7 +40,8 @@ def with_weights(command: C, weights: Any) -> C:
         # By the module tyro finds the comments that are shown as help.
         namespace={"__doc__": type(command).__doc__, "__module__": type(command).__module__},
     )
-    return own(**{field.name: getattr(command, field.name) for field in dataclasses.fields(command)})  # type: ignore
+    made: C = own(**vars(command))
+    return made
 
 
 def reward_of(command: Any) -> dict[str, float]:

@@ -28,7 +28,7 @@ class Finished:
 
 @struct.dataclass
 class Ended:
-    """Those episodes as rows, by step and then by environment."""
+    """Episodes as rows, by step and then by environment."""
 
     count: Any  # number of episodes; may exceed the room for rows
     index: Any  # Of their last step in the flattened unroll, `(room,)`; rows from `count` on hold nothing

@@ -36,7 +36,7 @@ class World:
 
     @property
     def covers(self) -> bool:
-        """Whether coverage is the task; elsewhere it says nothing."""
+        """True where coverage is the task; elsewhere it says nothing."""
         return hasattr(self.env, "rule") and self.env.rule.goal_kind == "cover"
 
     def scored(self) -> "World":

@@ -1,4 +1,4 @@
-"""What a reader of recordings returns, and folders of sweeps.
+"""Sweeps as readers of recordings return them, and folders of sweeps.
 
 A folder has one file a sweep (PCD, PLY or KITTI .bin), and times from a list or from the files' names.
 """

@@ -1,4 +1,4 @@
-"""What a network reads when it is trained is what it reads when it drives, on every task and with every memory."""
+"""Inputs of a network: the same in training and in driving, on every task and with every memory."""
 
 import dataclasses
 

@@ -37,7 +37,7 @@ def plans(plan_of):
 
 @pytest.fixture(scope="module")
 def drives(plans):
-    """Of each control period: positions over the tunnel's floor (m), velocities (m/s), mean turn of wheels (rad)."""
+    """Positions of each control period over the tunnel's floor (m), velocities (m/s), mean turn of wheels (rad)."""
     tracks, tunnel = [read_track(plan) for plan in plans], Tunnel.from_plan(plans[0], "smooth")
     both = join_tracks(tracks)
     worlds = [lambda p=plan, t=track: tunnel_world(p, t, "smooth") for plan, track in zip(plans, tracks, strict=True)]
