@@ -72,12 +72,15 @@ def build(
     """
     config = config or BuildConfig()
     name = config.name or out.name
-    require_folder(out)
+    require_folder(out, "manifest.json")
     check_settings(config)
     mounts = find_calibration(calibration)
     if reader is not None:
         load_module(reader)
     inputs = [path for path in (source, *more, trajectory, control) if path is not None and path.exists()]
+    for path in inputs:
+        if out.resolve() in path.resolve().parents:
+            raise RecordingError(f"{path}: lies in {out}, which the scene would replace")
     kept = find_kept(out, inputs, (config.reconstruct.voxel, config.reconstruct.reading, mounts, reader))
     refused = out.with_name(f"{out.name}-refused.html")  # the report then; the folder stays as it was
     started = time.monotonic()

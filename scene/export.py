@@ -218,7 +218,7 @@ def export(config: ExportConfig) -> Path:
     if endings:
         require_file(out, *endings)
     else:
-        require_folder(out)
+        require_folder(out, "model.sdf")
     manifest = json.loads(manifest_path.read_text())
     facts = {
         "name": manifest["name"], "provenance": manifest.get("input_provenance", "unknown"), "licence": config.licence,

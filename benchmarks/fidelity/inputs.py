@@ -208,7 +208,7 @@ def split_recording(recording: Path, out: Path, config: SplitConfig) -> dict[str
         FidelityError: It is no bag, or too short to give every part a block.
     """
     require_input(recording)
-    with _open_bag(recording) as reader, replace_folder(out) as folder:
+    with _open_bag(recording) as reader, replace_folder(out, "split.json") as folder:
         counts = _copy_messages(reader, folder, config, recording)
         facts = {
             "schema": SPLIT_SCHEMA, "rule": asdict(config), "messages": counts,

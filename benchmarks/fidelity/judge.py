@@ -104,7 +104,7 @@ def open_values(case: Case, folder: Path, processes: int = 1) -> Iterator[dict[s
             write_json(path, {"schema": VALUES_SCHEMA, "key": key, "values": dumped}, digits=17)
 
     with Stages() as progress, ExitStack() as second:
-        stages = {name: progress.start(f"metrics of {name}", table.COUNT) for name in names}
+        stages = {name: progress.start(f"metrics of {name}", len(table.load())) for name in names}
         if processes > 1 and names:
             context = multiprocessing.get_context("spawn")
             pool = second.enter_context(

@@ -11,7 +11,6 @@ import numpy as np
 from benchmarks.fidelity.files import FidelityError
 
 Need = Literal["hold", "truth", "reference"]
-COUNT = 199
 CATEGORIES = {
     "CEN": "Centreline and alignment", "SEC": "Cross-section dimensions",
     "C2M": "Surface accuracy: held-out real points to mesh", "CMP": "Completeness, Chamfer, F-score",

@@ -253,8 +253,8 @@ def _sweep_bound(
     poses = scene.drive.poses(at)
     tangent = scene.drive.bore.alignment.frames(scene.drive.station(at)).tangent[0]
     heading = rotate(np.repeat(poses.quaternion, len(rays), axis=0), rays)
-    caster.load(float(scene.drive.station(at)[0]), poses.position[0])
-    casts = [caster.cast_loaded(np.repeat(poses.position + shift * tangent, len(rays), axis=0), heading)
+    loaded = caster.load(float(scene.drive.station(at)[0]), poses.position[0])
+    casts = [loaded.cast(np.repeat(poses.position + shift * tangent, len(rays), axis=0), heading)
              for shift in PLACES]  # fmt: skip
     ranges = np.stack([one.distance for one in casts]).astype(np.float64)
     hits = casts[len(casts) // 2]

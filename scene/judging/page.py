@@ -70,7 +70,7 @@ def draw_profile(bore: Bore) -> str:
              for values, width, dash in ((floor, 1.6, ""), (z, 0.6, "6 4"), (crown, 1.6, ""))]  # fmt: skip
     for value in np.linspace(low + 0.5, high - 0.5, 3):
         y = 10 + (high - value) / (high - low) * (height - 40)
-        parts.append(f'<text x="{_MARGIN - 5}" y="{y + 4:.0f}" text-anchor="end">{value:.1f}</text>')
+        parts.append(f'<text x="{_MARGIN - 5}" y="{y + 4:.0f}" text-anchor="end">{value:.1f} m</text>')
     return _svg(_WIDTH, height, [*parts, *_station_axis(bore.length, height)])
 
 
@@ -227,13 +227,24 @@ def _tables(judgement: Judgement, content: dict[str, Any]) -> list[str]:
         for piece in (judgement.coverage.pieces if judgement.coverage is not None else ())
     ]
     provenance = sorted(content.get("provenance", {}).items())
-    read = [(key.replace("_", " "), value) for key, value in sorted(content.get("detected", {}).items())
+    detected = sorted(content.get("detected", {}).items())
+    read = [(key.replace("_", " "), _with_unit(key, value)) for key, value in detected
             if isinstance(value, str | int | float) and not isinstance(value, bool)]  # fmt: skip
     return [
         make_table("Cut away before fitting", removed), make_table("Unexplained, place by place", places[:20]),
         make_table("Wall that nobody saw", unseen[:20]), make_table("Measured or placed", provenance),
         make_table("How the input was read", read),
     ]  # fmt: skip
+
+
+# Units of what a manifest says was detected, by the ends of the names; the first that fits. The others have none.
+_UNITS = {"clock_offset": "s", "offset": "m", "rms": "m", "radius": "m", "radius_mean": "m", "radius_sd": "m",
+          "thickness": "m", "in_a_sweep": "m", "chainage_start": "m"}  # fmt: skip
+
+
+def _with_unit(key: str, value: Any) -> Any:
+    unit = next((unit for end, unit in _UNITS.items() if key.endswith(end)), "")
+    return f"{value:.5g} {unit}".strip() if isinstance(value, float) else value
 
 
 def make_table(title: str, rows: list[Any]) -> str:

@@ -1,8 +1,9 @@
 """Rays against the true mesh, the echoes that come back, and the sweeps of a LiDAR along the walk."""
 
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
@@ -10,7 +11,7 @@ from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from scene.survey.alignment import MARGIN, Alignment
-from scene.survey.carrier import Carried, rotate
+from scene.survey.carrier import Carried, Poses, rotate
 from scene.survey.config import SensorErrors
 from scene.survey.lidar import SCAN_PERIOD, Lidar, Sweep
 from scene.survey.mesh import Mesh, Part
@@ -31,6 +32,26 @@ class Hits:
     normal: Float32[np.ndarray, "n 3"]  # Unit normals, towards the air
 
 
+@dataclass(frozen=True)
+class Loaded:
+    """The part of a mesh within range of a carrier."""
+
+    scene: EmbreeScene  # Its triangles
+    origin: Float[np.ndarray, "3"]  # Point that the coordinates in the scene are relative to, m
+    part: UInt8[np.ndarray, "f"]  # `Part` of each triangle
+
+    def cast(self, origin: Float[np.ndarray, "n 3"], direction: Float[np.ndarray, "n 3"]) -> Hits:
+        """Return the first surface on each ray, of an origin, m, and a unit direction in the survey frame."""
+        direction = np.ascontiguousarray(direction, np.float32)
+        hit = self.scene.run((origin - self.origin).astype(np.float32), direction, output=True)
+        normal, met = hit["Ng"], hit["primID"] >= 0
+        size = np.sqrt(np.einsum("ij,ij->i", normal, normal))
+        normal = normal / np.where(met, size, 1.0).astype(np.float32)[:, None]
+        cosine = -np.einsum("ij,ij->i", normal, direction)
+        distance = np.where(met, hit["tfar"], np.float32(np.inf))
+        return Hits(distance, cosine, self.part[np.where(met, hit["primID"], 0)], normal)
+
+
 class Caster:
     """Casts rays at the mesh, of which only the part within range is loaded.
 
@@ -43,31 +64,18 @@ class Caster:
         self._behind = behind
         self._window: int | None = None
 
-    def load(self, station: float, near: Float[np.ndarray, "3"]) -> None:
-        """Loads what can be seen by a carrier at `station`, m, about `near`, m, if it is not yet."""
+    def load(self, station: float, near: Float[np.ndarray, "3"]) -> Loaded:
+        """Return what can be seen by a carrier at `station`, m, about `near`, m."""
         window = int(np.floor(station / _WINDOW))
-        if window == self._window:
-            return
-        begin, mesh = window * _WINDOW, self._mesh
-        chosen = (mesh.station >= begin - self._behind) & (mesh.station <= begin + _WINDOW + _REACH)
-        self._origin = np.floor(near)
-        self._part = mesh.part[chosen]
-        used, faces = np.unique(mesh.faces[chosen], return_inverse=True)
-        vertices = (mesh.vertices[used] - self._origin).astype(np.float32)
-        self._scene = EmbreeScene(robust=True)
-        TriangleMesh(self._scene, vertices, faces.reshape(-1, 3).astype(np.int32))
-        self._window = window
-
-    def cast_loaded(self, origin: Float[np.ndarray, "n 3"], direction: Float[np.ndarray, "n 3"]) -> Hits:
-        """Return the first loaded surface on each ray, of an origin, m, and a unit direction in the survey frame."""
-        direction = np.ascontiguousarray(direction, np.float32)
-        hit = self._scene.run((origin - self._origin).astype(np.float32), direction, output=True)
-        normal, met = hit["Ng"], hit["primID"] >= 0
-        size = np.sqrt(np.einsum("ij,ij->i", normal, normal))
-        normal = normal / np.where(met, size, 1.0).astype(np.float32)[:, None]
-        cosine = -np.einsum("ij,ij->i", normal, direction)
-        distance = np.where(met, hit["tfar"], np.float32(np.inf))
-        return Hits(distance, cosine, self._part[np.where(met, hit["primID"], 0)], normal)
+        if window != self._window:
+            begin, mesh, origin = window * _WINDOW, self._mesh, np.floor(near)
+            chosen = (mesh.station >= begin - self._behind) & (mesh.station <= begin + _WINDOW + _REACH)
+            used, faces = np.unique(mesh.faces[chosen], return_inverse=True)
+            scene = EmbreeScene(robust=True)
+            vertices = (mesh.vertices[used] - origin).astype(np.float32)
+            TriangleMesh(scene, vertices, faces.reshape(-1, 3).astype(np.int32))
+            self._loaded, self._window = Loaded(scene, origin, mesh.part[chosen]), window
+        return self._loaded
 
 
 FADING = 0.5  # standard deviation of the logarithm of the echo (speckle)
@@ -145,7 +153,7 @@ def mix_pixels(
     rng: np.random.Generator,
     lidar: Lidar,
     share: float,
-    caster: Caster,
+    loaded: Loaded,
     origin: Float[np.ndarray, "n 3"],
     heading: Float[np.ndarray, "n 3"],
     hits: Hits,
@@ -161,7 +169,7 @@ def mix_pixels(
     side = np.cross(ray, rng.standard_normal(ray.shape))
     side /= np.linalg.norm(side, axis=1, keepdims=True)
     rim = np.cos(lidar.divergence) * ray + np.sin(lidar.divergence) * side
-    other = caster.cast_loaded(origin[chosen], rim).distance
+    other = loaded.cast(origin[chosen], rim).distance
     step = np.where(np.isfinite(other), other - near, np.inf)
     reach = np.where(np.isfinite(other), other, 0.0)
     off_plane = reach * np.einsum("ij,ij->i", normal, rim) - near * np.einsum("ij,ij->i", normal, ray)
@@ -196,6 +204,28 @@ def n_sweeps(carried: Carried, every: int) -> int:
 Veil = Callable[[np.random.Generator, Float[np.ndarray, "n 3"], Hits], Hits]
 
 
+class _Look(NamedTuple):
+    """What the beams of some sweeps meet, before anything is drawn."""
+
+    numbers: np.ndarray
+    ray: Float[np.ndarray, "n 3"]  # Unit vectors in the LiDAR's frame
+    heading: Float[np.ndarray, "n 3"]  # The same in the survey frame
+    poses: Poses
+    station: float  # m
+    loaded: Loaded
+    hits: Hits
+
+
+def _look_ahead(look: Callable[[np.ndarray], _Look], batches: list[np.ndarray]) -> Iterator[_Look]:
+    """Yields the look of each batch; a second thread is one batch ahead, since numpy and embree leave it the time."""
+    with ThreadPoolExecutor(1) as second:
+        coming = [second.submit(look, batch) for batch in batches[:1]]
+        for following in [*batches[1:], None]:
+            found = coming.pop().result()
+            coming += [] if following is None else [second.submit(look, following)]
+            yield found
+
+
 def sweeps(
     rng: np.random.Generator,
     lidar: Lidar,
@@ -218,25 +248,30 @@ def sweeps(
     numbers = np.arange(0, round(carried.walk.duration / SCAN_PERIOD), every)
     # Poses come from a table over all sweeps that are cast together, so these must follow each other.
     at_once = max(1, _RAYS_AT_ONCE // len(offset)) if every == 1 else 1
-    for first in range(0, len(numbers), at_once):
-        batch = numbers[first : first + at_once]
-        n, begin = len(offset), SCAN_PERIOD * batch
+    n = len(offset)
+
+    def look(batch: np.ndarray) -> _Look:
+        begin = SCAN_PERIOD * batch
         ray = lidar.directions((begin[:, None] + 1e-9 * lidar.offset).ravel(), phase)
         poses = carried.poses_between(begin[0], (begin[:, None] + 1e-9 * offset).ravel())
         heading = rotate(poses.quaternion, ray)
-        caster.load(float(carried.walk.station(begin[:1])[0]), poses.position[0])
-        hits = caster.cast_loaded(poses.position, heading)
+        station = float(carried.walk.station(begin[:1])[0])
+        loaded = caster.load(station, poses.position[0])
+        return _Look(batch, ray, heading, poses, station, loaded, loaded.cast(poses.position, heading))
+
+    batches = [numbers[first : first + at_once] for first in range(0, len(numbers), at_once)]
+    for batch, ray, heading, poses, station, loaded, hits in _look_ahead(look, batches):
         if veil is not None:
             hits = veil(rng, ray, hits)
 
         factor: Any = 1.0
         if face is not None:
             ends = poses.position + np.where(np.isfinite(hits.distance), hits.distance, 0.0)[:, None] * heading
-            factor = face(float(carried.walk.station(begin[:1])[0]), ends, hits.part)
+            factor = face(station, ends, hits.part)
         valid = draw_returns(rng, lidar, errors, hits, factor)
         distance = hits.distance
         if errors.mixed_pixels > 0.0:
-            distance = mix_pixels(rng, lidar, errors.mixed_pixels, caster, poses.position, heading, hits)
+            distance = mix_pixels(rng, lidar, errors.mixed_pixels, loaded, poses.position, heading, hits)
         sigma = noise_sigma(errors, distance, hits.cosine)
         # Rounded once, here: the cloud and the bag then hold the same point.
         seen = np.where(valid, distance + sigma * rng.standard_normal(len(ray), np.float32), 0.0).astype(np.float32)
@@ -245,6 +280,7 @@ def sweeps(
         second = valid & (rng.random(len(ray), np.float32) < _SECOND_RETURN)
         velocity = None
         if doppler:
+            begin = SCAN_PERIOD * batch
             times = (begin[:, None] + 1e-9 * offset).ravel()
             later, earlier = (carried.poses_between(begin[0] + t, times + t).position for t in (_INSTANT, -_INSTANT))
             closing = np.einsum("ij,ij->i", later - earlier, heading) / (2.0 * _INSTANT)

@@ -12,12 +12,20 @@ from pathlib import Path
 from subterra_jax.host.errors import OutputError
 
 
-def require_folder(path: Path) -> Path:
+def require_folder(path: Path, mark: str | None = None) -> Path:
     """Checks that a folder can be written, without leaving anything behind, and returns its path.
 
+    Args:
+        mark: File that an earlier output holds, where the folder will be replaced whole.
+
     Raises:
-        OutputError: A file is in the way, at `path` or at a parent, or the disk refuses.
+        OutputError: A file is in the way, at `path` or at a parent, the disk refuses, or what would be replaced is no
+            earlier output.
     """
+    if mark is not None and not path.name:
+        raise OutputError(f"{path}: is the working folder, which is not replaced; name a folder in it")
+    if mark is not None and path.is_dir() and not (path / mark).is_file() and any(path.iterdir()):
+        raise OutputError(f"{path}: is no earlier output of this command, for it holds no {mark}; it is not replaced")
     place = next(place for place in (path, *path.absolute().parents) if place.exists())
     if not place.is_dir():
         raise OutputError(f"{place}: is a file, so no folder {path} can be written")
@@ -69,16 +77,16 @@ def replace_file(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def replace_folder(path: Path) -> Iterator[Path]:
+def replace_folder(path: Path, mark: str | None = None) -> Iterator[Path]:
     """Yields a temporary folder to write, which takes the place of `path` once the block ends without an error.
 
     A previous folder at `path` stays whole until then; after an error or an interrupt, nothing of the new one is left.
     The next call repairs what a killed process left behind.
 
     Raises:
-        OutputError: `path`, or a parent of it, is a file, or the disk refuses.
+        OutputError: See `require_folder`, which takes the same `mark`.
     """
-    require_folder(path)
+    require_folder(path, mark)
     fresh, stale = path.with_name(f".{path.name}.partial"), path.with_name(f".{path.name}.stale")
     try:
         _put_back(path, stale)

@@ -119,8 +119,10 @@ def test_a_failed_build_leaves_the_previous_scene_whole(scene, tmp_path, command
     before = {path: path.stat().st_mtime_ns for path in scene.rglob("*")}
     bad = tmp_path / "bad.ply"
     bad.write_bytes(b"ply\n")
-    status, _ = command(bad, "--out", scene)
-    assert status == 2
+    own = scene / "meshes" / "lining.ply"
+    for source, out, why in ((bad, scene, "bad.ply: "), (own, scene, "would replace"), (bad, tmp_path, "not replaced")):
+        status, said = command(source, "--out", out)
+        assert (status, why in said) == (2, True), said
     assert before == {path: path.stat().st_mtime_ns for path in scene.rglob("*")}
 
 

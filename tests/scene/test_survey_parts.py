@@ -13,7 +13,7 @@ from scene.survey import simulate
 from scene.survey.alignment import draw_railway, lay_out
 from scene.survey.bore import draw_bore
 from scene.survey.carrier import IMUS
-from scene.survey.cast import PULSE, Caster, Hits, draw_returns, mix_pixels, noise_sigma
+from scene.survey.cast import PULSE, Caster, Hits, Loaded, draw_returns, mix_pixels, noise_sigma
 from scene.survey.config import SensorErrors, SurveyConfig
 from scene.survey.furniture import DESIGN, TOLERANCE, draw_sizes
 from scene.survey.lidar import AVIA_POINT_RATE, Lidar, avia, avia_directions, os1, vlp16
@@ -63,20 +63,20 @@ def test_a_field_has_the_spread_and_correlation_asked_for() -> None:
 NEAR, FAR = 5.0, 5.3  # m: two walls across the x axis, with an edge at y = 0
 
 
-def two_walls() -> Caster:
+def two_walls() -> Loaded:
     """For y > 0 at `NEAR`, else at `FAR`; seen from the origin."""
     corners = [(x, y, z) for x, y0, y1 in ((NEAR, 0, 50), (FAR, -50, 50)) for y in (y0, y1) for z in (-50, 50)]
     faces = np.array([(0, 2, 1), (1, 2, 3), (4, 6, 5), (5, 6, 7)])[:, ::-1]
-    return Caster(Mesh(np.array(corners, float), faces, np.full(4, Part.LINING, np.uint8), np.zeros(4)))
+    mesh = Mesh(np.array(corners, float), faces, np.full(4, Part.LINING, np.uint8), np.zeros(4))
+    return Caster(mesh).load(0.0, np.zeros(3))
 
 
-def looked(caster: Caster, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, Hits]:
+def looked(walls: Loaded, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, Hits]:
     """Rays from the origin to `y` on the near wall's plane."""
     ray = np.stack([np.full_like(y, NEAR), y, np.full_like(y, 0.01)], axis=-1)
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     origin = np.zeros_like(ray)
-    caster.load(0.0, origin[0])
-    return origin, ray, caster.cast_loaded(origin, ray)
+    return origin, ray, walls.cast(origin, ray)
 
 
 def hits(distance: float, cosine: float, n: int) -> Hits:
@@ -86,9 +86,9 @@ def hits(distance: float, cosine: float, n: int) -> Hits:
 
 def mix(share: float, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Reported and true distances along x of beams at `y`, m."""
-    caster, lidar = two_walls(), os1()
-    origin, ray, seen = looked(caster, y)
-    distance = mix_pixels(np.random.default_rng(3), lidar, share, caster, origin, ray, seen)
+    walls, lidar = two_walls(), os1()
+    origin, ray, seen = looked(walls, y)
+    distance = mix_pixels(np.random.default_rng(3), lidar, share, walls, origin, ray, seen)
     return distance * ray[:, 0], seen.distance * ray[:, 0]
 
 
@@ -105,13 +105,13 @@ def test_mixed_pixels_lie_between_the_two_surfaces_of_an_edge_and_nowhere_else()
 
 
 def test_surfaces_further_apart_than_a_pulse_do_not_mix() -> None:
-    caster = two_walls()
+    walls = two_walls()
     # From 20 m to the side, the far wall's grazing continuation is beyond the pulse.
-    origin, ray, _ = looked(caster, np.full(2000, 1e-6))
+    origin, ray, _ = looked(walls, np.full(2000, 1e-6))
     back = origin + np.array([0.0, -20.0, 0.0])
     ray = np.array([NEAR, 20.0 + 1e-6, 0.0]) / np.hypot(NEAR, 20.0) + 0 * ray
-    seen = caster.cast_loaded(back, ray)
-    reported = mix_pixels(np.random.default_rng(0), os1(), 1.0, caster, back, ray, seen)
+    seen = walls.cast(back, ray)
+    reported = mix_pixels(np.random.default_rng(0), os1(), 1.0, walls, back, ray, seen)
     np.testing.assert_array_equal(reported, seen.distance)
     assert (FAR - NEAR) / NEAR * np.hypot(NEAR, 20.0) > PULSE
 

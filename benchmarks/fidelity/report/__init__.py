@@ -129,7 +129,7 @@ def _outside_entry(judgement: Judgement) -> dict[str, Any] | None:
     return {
         "files": outside.files(),
         "count": len(metrics),
-        "count_with_suite": table.COUNT + len(metrics),
+        "count_with_suite": len(table.load()) + len(metrics),
         "metrics": entries,
         "categories": {
             name: entry

@@ -59,7 +59,8 @@ def show_map(axes: plt.Axes, values: Float[np.ndarray, "n m"], extent: Any, **st
 # Voxels of the bore's shell, and the voxels in which cloud and mesh disagree (the paper's Fig. 3).
 
 
-_PLANES = (("station, m", "left, m", 2), ("station, m", "up, m", 1), ("left, m", "up, m", 0))
+_ALONG = "along the sensor's path, m"
+_PLANES = ((_ALONG, "left, m", 2), (_ALONG, "up, m", 1), ("left, m", "up, m", 0))
 
 
 def draw_projections(sheet: Sheet) -> Drawn:
@@ -73,6 +74,7 @@ def draw_projections(sheet: Sheet) -> Drawn:
                            cmap="viridis", norm=LogNorm(1), aspect="equal" if along == 0 else "auto")  # fmt: skip
         axis.set(xlabel=x, ylabel=y)
         figure.colorbar(picture, ax=axis, shrink=0.8, label="voxels" if along == 0 else None)
+    axes[2].invert_xaxis()  # left is drawn left
     caption = f"Occupied voxels of {edge * 100:.0f} cm of the bore's shell, summed along the third axis."
     return figure, caption + sheet.note(int(grids.first.sum()))
 
@@ -87,7 +89,7 @@ def draw_mismatch(sheet: Sheet) -> Drawn:
     show_map(side, flat, _extent(low[[0, 2]], edge, flat.shape), cmap=CLASSES, vmin=0, vmax=2)
     show_map(unrolled, rolled, (low[0], end, -180, 180), cmap=CLASSES, vmin=0, vmax=2)
     side.set(ylabel="up, m")
-    unrolled.set(ylabel="angle from left\ntowards up, deg", xlabel="station, m", yticks=_TURN)
+    unrolled.set(ylabel="angle from left\ntowards up, deg", xlabel=_ALONG, yticks=_TURN)
     names = ("both", "mesh only", "held-out cloud only")
     patches = [Patch(color=CLASSES(k), label=name) for k, name in enumerate(names)]
     side.legend(handles=patches, loc="upper center", bbox_to_anchor=(0.5, 1.22), ncol=3, frameon=False)
