@@ -18,7 +18,7 @@ import mujoco
 import tyro
 
 from scene.cleaning.clean import clean_cloud, crop_cloud, turn_round
-from scene.config import BuildConfig, ReconstructConfig, check_settings
+from scene.config import BuildConfig, ReconstructConfig, check_settings, check_words
 from scene.errors import Code, FitError, RecordingError, require_input
 from scene.fitting.lining import add_lining
 from scene.fitting.rings import fit_ring_survey
@@ -33,14 +33,13 @@ from scene.poses.calibration import UNCALIBRATED, Calibration, find_calibration
 from scene.poses.kept import find_kept, forget_kept, keep_placed, load_kept
 from scene.poses.place import Placed, place_cloud, place_recording
 from scene.progress import Stages
-from scene.reading.formats import describe, detect
+from scene.reading.formats import describe, detect, load_reader
 from scene.reading.ringsurvey import read_ring_survey
 from scene.reading.tables import given_columns
 from scene.writing.folder import Reconstruction, write_folder
 from scene.writing.track import Track, describe_track, lay_track
 from subterra_jax.host.command import parse, run_command
 from subterra_jax.host.files import replace_file, replace_folder, require_folder
-from subterra_jax.host.loading import load_module
 
 _DEFAULT = BuildConfig()
 
@@ -74,9 +73,10 @@ def build(
     name = config.name or out.name
     require_folder(out, "manifest.json")
     check_settings(config)
+    check_words(config.name, config.date)
     mounts = find_calibration(calibration)
     if reader is not None:
-        load_module(reader)
+        load_reader(reader)
     inputs = [path for path in (source, *more, trajectory, control) if path is not None and path.exists()]
     for path in inputs:
         if out.resolve() in path.resolve().parents:

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, field, fields, is_dataclass
+from datetime import date
 from typing import Any
 
 from scene.cleaning.clean import ExtentConfig
@@ -42,7 +43,10 @@ class SettingError(SubterraError):
     """A setting that no build can have."""
 
 
-_POSITIVE = ("spacing", "voxel", "cutoff", "gauge", "length", "width", "height", "diameter", "size")
+_LONGEST_NAME = 100  # characters
+_VOXELS = (0.001, 1.0)  # m: finer than a LiDAR measures, coarser than any wall shows
+_POSITIVE = ("spacing", "voxel", "cutoff", "gauge", "length", "width", "height", "diameter", "size",
+             "sigma", "per-scan", "max", "block")  # fmt: skip
 
 
 def check_settings(config: Any, prefix: str = "") -> None:
@@ -59,11 +63,24 @@ def check_settings(config: Any, prefix: str = "") -> None:
                 check_number(name, number)
 
 
+def check_words(name: str, day: str) -> None:
+    """Refuses a name that is no file's, and a day that is none; each may be empty. Raises `SettingError`."""
+    if len(name) > _LONGEST_NAME or not name.isprintable() or set(name) & set("/\\"):
+        why = f"must be at most {_LONGEST_NAME} characters of one line without / and \\"
+        raise SettingError(f"--name {why}, got {name[:_LONGEST_NAME]!r}")
+    try:
+        date.fromisoformat(day or "2026-01-01")
+    except ValueError:
+        raise SettingError(f"--date must be a day such as 2026-01-31, got {day!r}") from None
+
+
 def check_number(name: str, value: float) -> None:
-    """Refuses a number that is negative or not finite; `name` tells whether it may be 0. Raises `SettingError`."""
+    """Refuses a number out of its range; `name` tells the range. Raises `SettingError`."""
     if not math.isfinite(value):
         raise SettingError(f"--{name} must be a finite number, got {value}")
     if value < 0.0:
         raise SettingError(f"--{name} must not be negative, got {value:g}")
     if value == 0.0 and name.endswith(_POSITIVE):
         raise SettingError(f"--{name} must be above 0, got {value:g}")
+    if name.endswith("voxel") and not _VOXELS[0] <= value <= _VOXELS[1]:
+        raise SettingError(f"--{name} must lie between {_VOXELS[0]:g} and {_VOXELS[1]:g} m, got {value:g}")

@@ -107,6 +107,8 @@ def require_input(path: Path) -> Path:
     """
     if not path.exists():
         raise RecordingError(f"{path}: no such file or folder")
+    if not path.is_file() and not path.is_dir():
+        raise RecordingError(f"{path}: neither a file nor a folder; a pipe or device cannot be read twice")
     if path.is_file():
         try:
             path.open("rb").close()

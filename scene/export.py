@@ -208,18 +208,13 @@ def export(config: ExportConfig) -> Path:
     Raises:
         SubterraError: The scene is missing or damaged, or the output cannot be written.
     """
-    manifest_path = config.scene / "manifest.json"
-    if not manifest_path.is_file():
-        raise RecordingError(
-            f"{config.scene}: not a scene folder, for it has no manifest.json; build it with scene.build"
-        )
+    manifest = read_manifest(config.scene)
     endings = _ENDINGS[config.to]
     out = config.out or config.scene.with_name(f"{config.scene.name}{endings[0] if endings else '-sdf'}")
     if endings:
         require_file(out, *endings)
     else:
         require_folder(out, "model.sdf")
-    manifest = json.loads(manifest_path.read_text())
     facts = {
         "name": manifest["name"], "provenance": manifest.get("input_provenance", "unknown"), "licence": config.licence,
         "origin": manifest["frame"]["origin"], "crs": manifest["frame"].get("crs") or "not stated",

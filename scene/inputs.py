@@ -1,14 +1,19 @@
-"""Inputs and libraries of a build: name, size and hash of its inputs, and versions of the libraries that read them."""
+"""Inputs of a build: names, sizes, hashes, versions of the libraries that read them; the manifest of a built scene."""
 
 import hashlib
+import json
 from collections.abc import Callable
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from scene.errors import RecordingError
 from scene.progress import Stages
 
+MANIFEST_SCHEMA = "subterra.manifest/1"
 _CHUNK = 1 << 22  # bytes read at once
 
 
@@ -55,3 +60,30 @@ def _folder_record(path: Path, advance: Callable[[int], None]) -> dict[str, Any]
     digest = hashlib.sha256("".join(f"{r['file']} {r['sha256']}\n" for r in records).encode())
     size = sum(record["bytes"] for record in records)
     return {"folder": path.name, "files": len(records), "bytes": size, "sha256": digest.hexdigest()}
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """Reads the manifest of a scene folder.
+
+    Raises:
+        RecordingError: It cannot be read, has another schema, or lacks a name, the frame's origin, inputs or files.
+    """
+    path = folder / "manifest.json"
+    if not path.is_file():
+        raise RecordingError(f"{folder}: not a scene folder, for it has no manifest.json; build it with scene.build")
+    try:
+        manifest: dict[str, Any] = json.loads(path.read_text())
+        schema = manifest.get("schema")
+    except (OSError, ValueError, AttributeError) as error:
+        raise RecordingError(f"{path}: is no manifest ({error})") from error
+    if schema != MANIFEST_SCHEMA:
+        raise RecordingError(f"{path}: schema is {schema}, not {MANIFEST_SCHEMA}; build the scene anew")
+    try:
+        origin, inputs = np.asarray(manifest["frame"]["origin"], float), manifest.get("inputs", [])
+        whole = origin.shape == (3,) and bool(np.isfinite(origin).all()) and isinstance(manifest["name"], str)
+        whole &= isinstance(manifest.get("files", {}), dict) and all(isinstance(one, dict) for one in inputs)
+    except (KeyError, TypeError, ValueError):
+        whole = False
+    if not whole:
+        raise RecordingError(f"{path}: its name, frame, inputs or files are malformed; build the scene anew")
+    return manifest

@@ -8,14 +8,6 @@ truth or control   ┴─► references ┘
 from subterra_jax.host.command import require_libraries
 
 require_libraries(
-    "benchmarks.fidelity",
-    "fidelity,recordings",
-    "sklearn",
-    "skimage",
-    "gudhi",
-    "cc3d",
-    "pymeshlab",
-    "py4dgeo",
-    "jinja2",
-    "rosbags",
-)
+    "benchmarks.fidelity", "fidelity,recordings", "sklearn", "skimage", "gudhi", "cc3d", "pymeshlab", "py4dgeo",
+    "jinja2", "rosbags",
+)  # fmt: skip

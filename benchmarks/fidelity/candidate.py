@@ -1,9 +1,9 @@
 """The reconstruction to be judged: the files of one scene folder in memory, and the geoms and track of its scene."""
 
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import mujoco
 import numpy as np
@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.fidelity.files import FidelityError, file_hash
 from benchmarks.fidelity.meshes import concatenate_meshes
 from scene.export import geom_triangles
+from scene.inputs import read_manifest
 
 
 def load_model(scene: Path) -> mujoco.MjModel:
@@ -101,8 +102,6 @@ def track_of(geoms: Geoms) -> Track:
 
 # The candidate: the files of one scene folder.
 
-MANIFEST_SCHEMA = "subterra.manifest/1"
-
 
 @dataclass(frozen=True)
 class Bore:
@@ -162,39 +161,38 @@ def load_candidate(folder: Path) -> Candidate:
     for needed in (scene, folder / "bore.npz", folder / "tunnel.npz", folder / "manifest.json"):
         if not needed.exists():
             raise FidelityError(f"{folder}: is no scene folder, {needed.name} is missing")
-    manifest = _read_manifest(folder)
+    manifest = read_manifest(folder)
+    _check_files(folder, manifest)
     try:
         with np.load(folder / "bore.npz") as data:
             bore = Bore(**{name: data[name] for name in Bore.__dataclass_fields__})
+        _require_whole(bore)
         files = (folder / "meshes" / f"{name}.ply" for name in ("lining", "solid"))
         lining, solid = (trimesh.load_mesh(file, process=False) for file in files)
         for mesh in (lining, solid):
             mesh.metadata.clear()  # the file's own arrays, as large as the mesh
         geoms = Geoms.of(load_model(scene))
         track, nails, bed = track_of(geoms), geoms.joined("nails_"), geoms.joined("bed_", group=0)
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, BadZipFile) as error:
         raise FidelityError(f"{folder}: cannot be read as a scene ({error})") from error
     plan = folder / "tunnel.npz"
     return Candidate(manifest["name"], folder, lining, solid, bore, track, manifest, scene, plan, nails=nails, bed=bed)
 
 
-def _read_manifest(folder: Path) -> dict[str, Any]:
-    """Reads the manifest of a scene folder and checks the files that it names.
+def _require_whole(bore: Bore) -> None:
+    """Raises `ValueError` for arrays that make no bore."""
+    rows = (bore.station, bore.position, bore.tangent, bore.lateral, bore.up, bore.width, bore.height, bore.radius)
+    if len({len(row) for row in rows}) > 1 or len(bore.station) < 2 or bore.radius.shape[1:] != bore.angle.shape:
+        raise ValueError("the arrays of bore.npz differ in length")
+    if not all(np.isfinite(row).all() for row in rows) or (np.diff(bore.station) <= 0.0).any():
+        raise ValueError("numbers in bore.npz are not finite, or its stations do not grow")
 
-    Raises:
-        FidelityError: It cannot be read or has another schema; a file is missing or has changed since the build.
-    """
-    path = folder / "manifest.json"
-    try:
-        manifest: dict[str, Any] = json.loads(path.read_text())
-        schema = manifest.get("schema")
-    except (OSError, ValueError, AttributeError) as error:
-        raise FidelityError(f"{path}: is no manifest ({error})") from error
-    if schema != MANIFEST_SCHEMA:
-        raise FidelityError(f"{path}: schema is {schema}, not {MANIFEST_SCHEMA}; build the scene anew")
+
+def _check_files(folder: Path, manifest: dict[str, Any]) -> None:
+    """Refuses a scene folder of which a file is missing, or has changed since the build; raises `FidelityError`."""
     for name, expected in manifest.get("files", {}).items():
-        if not (folder / name).is_file():
-            raise FidelityError(f"{folder / name}: is missing, though {path.name} names it")
-        if file_hash(folder / name) != expected:
-            raise FidelityError(f"{folder / name}: its SHA-256 is not that of {path.name}; it changed after the build")
-    return manifest
+        file = folder / name
+        if not file.is_file():
+            raise FidelityError(f"{file}: is missing, though manifest.json names it")
+        if file_hash(file) != expected:
+            raise FidelityError(f"{file}: its SHA-256 is not that of manifest.json; it changed after the build")

@@ -24,6 +24,7 @@ from benchmarks.fidelity.derive.curve import Curve
 from benchmarks.fidelity.files import FidelityError, file_hash, write_json
 from benchmarks.fidelity.references import Hold, HoldConfig, load_hold, load_truth
 from benchmarks.fidelity.windows.judge import LONG
+from scene.config import check_number, check_settings
 from scene.errors import require_input
 from scene.progress import Stages
 from subterra_jax.host.errors import SubterraError
@@ -61,13 +62,14 @@ def complete_inputs(inputs: Inputs) -> Inputs:
         SubterraError: A path does not exist.
         FidelityError: What is given does not go together.
     """
-    if inputs.seed < 0:
-        raise FidelityError(f"seed must not be negative, got {inputs.seed}")
+    check_number("seed", inputs.seed)
+    check_settings(inputs.hold)
     if inputs.scene is None:
         if inputs.recording or inputs.truth:
             raise FidelityError("--recording and --truth need --scene: what was reconstructed?")
         return packaged_inputs(inputs)
-    for path in (inputs.scene, inputs.recording, inputs.trajectory, inputs.truth, inputs.fit_recording):
+    for path in (inputs.scene, inputs.recording, inputs.trajectory, inputs.truth, inputs.fit_recording,
+                 inputs.fit_trajectory):  # fmt: skip
         if path is not None:
             require_input(path)
     if (inputs.recording is None) != (inputs.trajectory is None):
@@ -208,6 +210,12 @@ def split_recording(recording: Path, out: Path, config: SplitConfig) -> dict[str
         FidelityError: It is no bag, or too short to give every part a block.
     """
     require_input(recording)
+    check_settings(config)
+    fifths = np.round(5 * np.asarray(config.shares))
+    if fifths.sum() != 5 or (fifths < 1).any():
+        raise FidelityError(f"shares must be fifths, each at least one, that sum to 1, got {config.shares}")
+    if config.guard >= config.block:
+        raise FidelityError(f"guard must be shorter than a block of {config.block:g} s, got {config.guard:g}")
     with _open_bag(recording) as reader, replace_folder(out, "split.json") as folder:
         counts = _copy_messages(reader, folder, config, recording)
         facts = {

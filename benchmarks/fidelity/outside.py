@@ -34,7 +34,7 @@ def load_file(path: Path) -> None:
         runpy.run_path(str(path))
     except FidelityError as error:
         raise FidelityError(f"{path}: {error}") from error
-    except Exception as error:  # anything may go wrong in a user's file
+    except (Exception, SystemExit) as error:  # anything may go wrong in a user's file
         raise FidelityError(f"{path}: cannot be run ({type(error).__name__}: {error})") from error
     finally:
         _LOADED.update({*table.load_all(), *faults.KINDS} - before)

@@ -226,12 +226,17 @@ def load_truth(folder: Path, origin: Float[np.ndarray, "3"]) -> Truth:
     path = folder / "truth.json"
     if not path.exists() or not (folder / "truth.ply").exists():
         raise FidelityError(f"{folder}: holds no truth.json with its truth.ply")
-    data = json.loads(path.read_text())
-    if data.get("schema") != TRUTH_SCHEMA:
-        raise FidelityError(f"{path}: schema is {data.get('schema')}, not {TRUTH_SCHEMA}")
-    surface, part = _read_parts(folder / "truth.ply", origin)
-    columns = (np.asarray(data[name], float) for name in ("station", "position", "tangent", "width", "height"))
-    station, position, tangent, width, height = columns
+    try:
+        data = json.loads(path.read_text())
+        if data.get("schema") != TRUTH_SCHEMA:
+            raise ValueError(f"schema is {data.get('schema')}, not {TRUTH_SCHEMA}")
+        surface, part = _read_parts(folder / "truth.ply", origin)
+        names = ("station", "position", "tangent", "width", "height")
+        station, position, tangent, width, height = columns = [np.asarray(data[name], float) for name in names]
+        if len({len(column) for column in columns}) > 1 or not all(np.isfinite(column).all() for column in columns):
+            raise ValueError("its columns differ in length or are not finite")
+    except Exception as error:  # JSON, PLY and numpy raise their own
+        raise FidelityError(f"{path}: cannot be read with its truth.ply ({error})") from error
     furniture = {name: data[name] for name in ("rings", "pockets", "nails", "sleepers", "rails") if name in data}
     return Truth(station, position - origin, tangent, width, height, surface, part, PARTS, furniture, origin)
 

@@ -16,6 +16,7 @@ from scene.reading.rosbag import RosBag
 from scene.reading.scans import open_folder, scan_files
 from scene.reading.tables import open_ptx, open_table
 from scene.reading.times import TimeConfig
+from subterra_jax.host.loading import UserCodeError, load_module
 
 Kind = Literal["recording", "cloud", "rings"]
 _SHOWN_FACTS = ("format", "topic", "message_type", "times", "point_times", "unit", "axes", "crs")
@@ -115,6 +116,13 @@ def register_reader(
     if kind not in ("recording", "cloud"):
         raise ValueError(f"kind must be recording or cloud, got {kind!r}")
     _own[name] = Format(name, label or name, kind, open, suffixes, magic)
+
+
+def load_reader(source: str) -> None:
+    """Runs a file or module of the user's; raises `UserCodeError` where that fails, or no reader is registered."""
+    load_module(source)
+    if not _own:
+        raise UserCodeError(f"{source}: registers no reader")
 
 
 def detect(path: Path, name: str | None = None) -> Detected:

@@ -20,7 +20,7 @@ from scene.cloud import Cloud, thin_cloud
 from scene.config import BuildConfig
 from scene.errors import FitError, Refusal
 from scene.fitting.trackseen import SeenTrack
-from scene.inputs import library_versions
+from scene.inputs import MANIFEST_SCHEMA, library_versions
 from scene.judging.judge import Judgement
 from scene.judging.page import render_page
 from scene.poses.trajectory import Trajectory, save_tum
@@ -50,7 +50,6 @@ class Reconstruction:
 
 
 SCENES = ("scene.xml", "scene_furnished.xml")
-MANIFEST_SCHEMA = "subterra.manifest/1"
 _LIBRARIES = (
     "numpy", "scipy", "trimesh", "manifold3d", "mujoco", "rosbags", "small-gicp", "plyfile", "pypcd4", "laspy", "lazrs",
     "pye57", "openpyxl", "shapely",

@@ -119,6 +119,9 @@ def lay_track(bore: Bore, config: TrackConfig, seen: SeenTrack | None = None) ->
     the margin is left out between rails that the survey shows, whose sleepers are not as long as the standard's;
     without such rails it raises `FitError`.
     """
+    if config.gauge + 2.0 * config.rail.head_width > config.sleeper_length:
+        why = f"a gauge of {config.gauge:g} m puts the rails beyond the ends of sleepers of {config.sleeper_length:g} m"
+        raise FitError(f"{why}; --track.sleeper-length sets those", Refusal.TRACK)
     half_width = config.sleeper_length / 2 + config.shoulder
     floor = bore.position[:, 2] - bore.toward(-np.pi / 2) * bore.up[:, 2]
     chord = bore.position[:, 2] + _lowest_chord(bore, half_width)

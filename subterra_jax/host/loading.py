@@ -30,7 +30,7 @@ def load_file(path: Path) -> ModuleType:
     module = sys.modules[name] = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
-    except Exception as error:
+    except (Exception, SystemExit) as error:  # a file that exits would end the command without a word
         del sys.modules[name]
         raise UserCodeError(f"{path}: {type(error).__name__}: {error}") from error
     return module
@@ -46,7 +46,7 @@ def load_module(source: str) -> ModuleType:
         return load_file(Path(source))
     try:
         return importlib.import_module(source)
-    except Exception as error:  # a user's code raises anything
+    except (Exception, SystemExit) as error:  # a user's code raises anything
         raise UserCodeError(f"{source}: {error}") from error
 
 

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 import re
 import resource
 import signal
@@ -126,61 +127,51 @@ def test_a_failed_build_leaves_the_previous_scene_whole(scene, tmp_path, command
     assert before == {path: path.stat().st_mtime_ns for path in scene.rglob("*")}
 
 
-def bad_inputs(folder: Path) -> dict[str, tuple[list[object], str]]:
-    short = folder / "short.ply"
-    trimesh.PointCloud(curved_d_bore(length=5).points).export(short)
-    plane = folder / "plane.ply"
-    rng = np.random.default_rng(0)
-    trimesh.PointCloud(np.column_stack([rng.uniform(0, 60, 9999), rng.uniform(0, 8, 9999), np.zeros(9999)])).export(
-        plane
-    )
-    nan = folder / "nan.ply"
-    trimesh.PointCloud(np.full((99, 3), np.nan)).export(nan)
-    scans = [(100.0 + 0.1 * k, rng.uniform(-3, 3, (200, 3))) for k in range(5)]
-    bag = write_bag(folder / "a.bag", scans)
-    cut = folder / "cut.bag"
-    cut.write_bytes(bag.read_bytes()[:500])
-    note = write_bag_without_lidar(folder / "note.bag")
-    early = write_tum(folder / "early.tum", np.column_stack([np.arange(9.0), np.zeros((9, 6)), np.ones(9)]))
-    unknown = folder / "x.docx"
-    unknown.write_text("x")
-    empty = folder / "empty"
-    empty.mkdir()
-    return {
-        "missing file": ([folder / "none.bag"], r"none\.bag: no such file"),
-        "unknown kind": ([unknown], r"x\.docx: of no known kind"),
-        "truncated bag": ([cut], r"cut\.bag: not a whole ROS1 bag"),
-        "no LiDAR": ([note], r"note\.bag: has no LiDAR topic"),
-        "poses elsewhere": ([bag, "--trajectory", early], r"early\.tum runs from 0\.00 to 8\.00 s, but the LiDAR"),
-        "no trajectory file": ([bag, "--trajectory", folder / "no.tum"], r"no\.tum: no such file"),
-        "cloud and poses": ([short, "--trajectory", early], r"early\.tum: a trajectory goes with a bag"),
-        "NaN cloud": ([nan], r"nan\.ply: none of its 99 points is finite"),
-        "too short": ([short], r"short\.ply: the tunnel is .* m long; at least 10 m"),
-        "no tunnel": ([plane], r"plane\.ply: "),
-        "empty folder": ([empty], r"empty: of no known kind"),
-    }
-
-
-CASES = [
-    "missing file", "unknown kind", "truncated bag", "no LiDAR", "poses elsewhere", "no trajectory file",
-    "cloud and poses", "NaN cloud", "too short", "no tunnel", "empty folder",
-]  # fmt: skip
+BAD = {  # words of a command, @ before files of the folder below, and the sentence
+    "@none.bag": r"none\.bag: no such file",
+    "@x.docx": r"x\.docx: of no known kind",
+    "@cut.bag": r"cut\.bag: not a whole ROS1 bag",
+    "@note.bag": r"note\.bag: has no LiDAR topic",
+    "@a.bag --trajectory @early.tum": r"early\.tum runs from 0\.00 to 8\.00 s, but the LiDAR",
+    "@a.bag --trajectory @no.tum": r"no\.tum: no such file",
+    "@short.ply --trajectory @early.tum": r"early\.tum: a trajectory goes with a bag",
+    "@nan.ply": r"nan\.ply: none of its 99 points is finite",
+    "@short.ply": r"short\.ply: the tunnel is .* m long; at least 10 m",
+    "@plane.ply": r"plane\.ply: ",
+    "@empty": r"empty: of no known kind",
+    "@pipe": "pipe: neither a file nor a folder",
+    "@short.ply --name a/b": "--name must be at most 100 characters",
+    "@short.ply --date yesterday": "--date must be a day such as",
+    "@short.ply --reconstruct.voxel 9": r"--reconstruct\.voxel must lie between 0\.001 and 1 m, got 9",
+    "@short.ply --reader @exits.py": r"exits\.py: SystemExit",
+}
 
 
 @pytest.fixture(scope="module")
-def inputs(tmp_path_factory):
-    return bad_inputs(tmp_path_factory.mktemp("bad"))
+def inputs(tmp_path_factory) -> Path:
+    folder, rng = tmp_path_factory.mktemp("bad"), np.random.default_rng(0)
+    flat = np.column_stack([rng.uniform(0, 60, 9999), rng.uniform(0, 8, 9999), np.zeros(9999)])
+    for name, points in (("short", curved_d_bore(length=5).points), ("plane", flat), ("nan", np.full((99, 3), np.nan))):
+        trimesh.PointCloud(points).export(folder / f"{name}.ply")
+    bag = write_bag(folder / "a.bag", [(100.0 + 0.1 * k, rng.uniform(-3, 3, (200, 3))) for k in range(5)])
+    (folder / "cut.bag").write_bytes(bag.read_bytes()[:500])
+    write_bag_without_lidar(folder / "note.bag")
+    write_tum(folder / "early.tum", np.column_stack([np.arange(9.0), np.zeros((9, 6)), np.ones(9)]))
+    (folder / "x.docx").write_text("x")
+    (folder / "exits.py").write_text("raise SystemExit(0)")
+    (folder / "empty").mkdir()
+    os.mkfifo(folder / "pipe")
+    return folder
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", BAD)
 def test_bad_input_is_one_sentence_status_2_and_no_output(case, inputs, tmp_path, command):
-    arguments, sentence = inputs[case]
     out = tmp_path / "scene"
-    status, outcome = command(*arguments, "--out", out)
+    status, outcome = command(*(inputs / word[1:] if word[0] == "@" else word for word in case.split()), "--out", out)
     assert status == 2, outcome
     lines = [line for line in outcome.splitlines() if line.strip()]
     assert len(lines) == 1, outcome
-    assert re.search(rf"^error: .*{sentence}", lines[0]), lines[0]
+    assert re.search(rf"^error: .*{BAD[case]}", lines[0]), lines[0]
     assert not list(tmp_path.iterdir())
 
 

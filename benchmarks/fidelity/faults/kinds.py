@@ -14,6 +14,7 @@ from benchmarks.fidelity.candidate import Bore, Candidate
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.derive.curve import Curve
 from benchmarks.fidelity.files import FidelityError
+from benchmarks.fidelity.table import CATEGORIES
 
 RAMP = 0.5  # m before and after a local fault over which it grows
 MESHES = ("lining", "solid", "nails", "bed", "extra")
@@ -132,13 +133,18 @@ def fault_kind(name: str, words: str, unit: str = "1", **more: object) -> Callab
         **more: Further fields of `Kind`; with `doses` and `falls` a kind from outside is a control too.
 
     Raises:
-        FidelityError: The name is taken.
+        FidelityError: The name is taken, or is no file's, or `falls` names no category.
     """
     if name in KINDS:
         raise FidelityError(f"fault {name!r}: this kind is registered twice")
+    if "/" in name or name in suite_controls():
+        raise FidelityError(f"fault {name!r}: the name has a slash, or is that of a control; choose another")
 
     def register(change: Callable) -> Callable:
-        KINDS[name] = Kind(words, unit, change, **more)  # type: ignore[arg-type]
+        kind = Kind(words, unit, change, **more)  # type: ignore[arg-type]
+        if unknown := set(kind.falls) - set(CATEGORIES):
+            raise FidelityError(f"fault {name!r}: unknown category {min(unknown)!r} in falls")
+        KINDS[name] = replace(kind, doses=tuple(map(float, kind.doses)))
         return change
 
     return register

@@ -22,6 +22,7 @@ from benchmarks.fidelity.inputs import (
     with_sigma,
 )
 from benchmarks.fidelity.references import HoldConfig
+from subterra_jax.host.errors import SubterraError
 from tests.benchmarks.fidelity import tube
 from tests.scene.bags import write_bag
 
@@ -31,6 +32,9 @@ def test_a_recording_without_poses_and_references_without_a_scene_are_refused(tm
         complete_inputs(Inputs(scene=tmp_path, recording=tmp_path))
     with pytest.raises(FidelityError, match="need --scene"):
         complete_inputs(Inputs(truth=tmp_path))
+    for wrong in (Inputs(seed=-1), Inputs(hold=HoldConfig(sigma=0.0)), Inputs(hold=HoldConfig(beams_per_scan=0))):
+        with pytest.raises(SubterraError, match="must"):
+            complete_inputs(wrong)
 
 
 def test_the_noise_of_a_sensor_comes_from_its_data_sheet() -> None:
@@ -128,4 +132,7 @@ def test_a_recording_shorter_than_five_blocks_is_refused(tmp_path: Path) -> None
     short = write_bag(tmp_path / "short.bag", [(100.0 + k, np.ones((2, 3))) for k in range(5)])
     with pytest.raises(FidelityError, match="shorter than five blocks"):
         split_recording(short, tmp_path / "parts", CONFIG)
+    for wrong in (SplitConfig(block=0.0), SplitConfig(guard=2.0), SplitConfig(shares=(0.5, 0.5, 0.5))):
+        with pytest.raises(SubterraError, match=r"block|shares"):
+            split_recording(short, tmp_path / "parts", wrong)
     assert not (tmp_path / "parts").exists()

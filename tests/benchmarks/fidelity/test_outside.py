@@ -27,7 +27,10 @@ MISTAKES = {
     'for _ in "ab": metric("lin_x", "LIN")(lambda case: 1.0)': "metric 'lin_x': this id is taken",
     "undefined": "cannot be run (NameError: name 'undefined' is not defined)",
     'fault_kind("wall", "mine")(lambda site, fault: site.candidate)': "fault 'wall': this kind is registered twice",
+    'fault_kind("N01", "mine")(lambda site, fault: 1)': "fault 'N01': the name has a slash, or is that of a control",
+    'fault_kind("x", "mine", falls={"LNI": 9.0})(lambda site, fault: 1)': "fault 'x': unknown category 'LNI' in falls",
     "import": "cannot be run (SyntaxError: ",
+    "exit()": "cannot be run (SystemExit: ",
     "": "registers neither a metric nor a fault",
 }
 

@@ -65,14 +65,20 @@ def test_a_truth_is_read_as_it_was_written(known: Truth, folder: Path) -> None:
     assert read.furniture["rails"]["gauge"] == pytest.approx(1.435)
 
 
-def test_a_truth_of_another_schema_is_refused(known: Truth, folder: Path) -> None:
+def test_a_truth_that_is_none_is_refused(known: Truth, folder: Path) -> None:
     path = folder / "truth.json"
-    path.write_text(path.read_text().replace(TRUTH_SCHEMA, "subterra.truth/0"))
-    with pytest.raises(FidelityError, match=r"truth\.json: schema is subterra\.truth/0"):
-        load_truth(folder, known.origin)
+    text = path.read_text()
+    for old, new, why in ((TRUTH_SCHEMA, "a/0", "schema is a/0"), (text, "[1]", "list"), (text, text[:99], "char"),
+                          ('"width"', '"wide"', "width"), ("0.0,", "", "in length")):  # fmt: skip
+        path.write_text(text.replace(old, new, 1))
+        with pytest.raises(FidelityError, match=rf"truth\.json: cannot be read with its truth\.ply \(.*{why}"):
+            load_truth(folder, known.origin)
 
 
 def test_a_folder_without_a_surface_has_no_truth(known: Truth, folder: Path) -> None:
+    (folder / "truth.ply").write_text("ply")
+    with pytest.raises(FidelityError, match="cannot be read"):
+        load_truth(folder, known.origin)
     (folder / "truth.ply").unlink()
     with pytest.raises(FidelityError, match=r"holds no truth\.json with its truth\.ply"):
         load_truth(folder, known.origin)

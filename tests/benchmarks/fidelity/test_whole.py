@@ -5,6 +5,7 @@ import gc
 import json
 import shutil
 import sys
+from collections.abc import Callable
 from contextlib import redirect_stdout
 from dataclasses import replace
 from hashlib import sha256
@@ -128,9 +129,7 @@ def test_what_a_second_process_computed_is_what_this_one_computes(scored, scene,
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_a_metric_from_a_file_is_listed_apart_and_the_verdict_stays_the_suite_s(
-    scored, tmp_path, monkeypatch, capsys
-) -> None:
+def test_a_metric_from_a_file_is_listed_apart(scored, tmp_path, monkeypatch, capsys) -> None:
     before, words, _ = scored
     out = Path(shutil.copytree(before, tmp_path / "out"))  # its values are read again, not computed
     file = tmp_path / "my_metrics.py"
@@ -170,51 +169,49 @@ def _code_of_the_guide() -> str:
     return next(block for block in blocks if "lin_deep_pocket_ratio" in block)
 
 
-def _mesh_gone(folder: Path) -> str:
-    (folder / "meshes" / "lining_000.obj").unlink()
-    return f"{folder}/meshes/lining_000.obj: is missing, though manifest.json names it"
+def _manifest(**entries: object) -> Callable[[Path], object]:
+    """Changes entries of a manifest; none of its files is checked then."""
+
+    def change(folder: Path, name: str = "manifest.json") -> None:
+        (folder / name).write_text(json.dumps(json.loads((folder / name).read_text()) | {"files": {}} | entries))
+
+    return change
 
 
-def _mesh_changed(folder: Path) -> str:
-    with (folder / "meshes" / "lining.ply").open("ab") as file:
-        file.write(b" ")
-    return f"{folder}/meshes/lining.ply: its SHA-256 is not that of manifest.json; it changed after the build"
+def _bore(name: str, change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], object]:
+    def write(folder: Path) -> None:
+        data = dict(np.load(_manifest()(folder) or folder / "bore.npz"))
+        np.savez(folder / "bore.npz", **{**data, name: change(data[name])})
+
+    return write
 
 
-def _old_schema(folder: Path) -> str:
-    path = folder / "manifest.json"
-    path.write_text(path.read_text().replace("subterra.manifest/1", "subterra.manifest/0"))
-    return f"{path}: schema is subterra.manifest/0, not subterra.manifest/1; build the scene anew"
+UNREAD, MALFORMED = ": cannot be read as a scene ", "/manifest.json: its name, frame, inputs or files are malformed"
+WRONG = (
+    (lambda folder: (folder / "meshes/lining_000.obj").unlink(), "/meshes/lining_000.obj: is missing, though"),
+    (lambda folder: (folder / "meshes/lining.ply").write_text(""), "/meshes/lining.ply: its SHA-256 is not that of"),
+    (_manifest(schema="subterra.manifest/0"), "/manifest.json: schema is subterra.manifest/0, not subterra.manifest/1"),
+    (lambda folder: (folder / "manifest.json").write_text("{"), "/manifest.json: is no manifest"),
+    (lambda folder: (_manifest()(folder), (folder / "meshes/lining_000.obj").unlink()), UNREAD),
+    (lambda folder: (_manifest()(folder), (folder / "bore.npz").write_text("x" * 99)), UNREAD),
+    (_manifest(frame={}), MALFORMED), (_manifest(frame={"origin": [0, 0]}), MALFORMED),
+    (_manifest(inputs=["a"]), MALFORMED), (_manifest(files=["a"]), MALFORMED), (_manifest(name=None), MALFORMED),
+    (_bore("position", lambda rows: rows * np.nan), UNREAD), (_bore("radius", lambda rows: rows[:5]), UNREAD),
+    (_bore("station", lambda rows: rows[::-1]), UNREAD),
+)  # fmt: skip
 
 
-def _no_manifest(folder: Path) -> str:
-    (folder / "manifest.json").write_text("{")
-    return f"{folder}/manifest.json: is no manifest"
-
-
-def _mesh_gone_from_an_older_scene(folder: Path) -> str:
-    path = folder / "manifest.json"
-    manifest = {name: value for name, value in json.loads(path.read_text()).items() if name != "files"}
-    path.write_text(json.dumps(manifest))
-    (folder / "meshes" / "lining_000.obj").unlink()
-    return f"{folder}: cannot be read as a scene"
-
-
-@pytest.mark.parametrize(
-    "corrupt", [_mesh_gone, _mesh_changed, _old_schema, _no_manifest, _mesh_gone_from_an_older_scene]
-)
-def test_what_is_wrong_with_a_scene_is_said_in_one_sentence(own_scene, tmp_path, monkeypatch, capsys, corrupt) -> None:
-    expected = corrupt(own_scene)
+@pytest.mark.parametrize(("corrupt", "expected"), WRONG)
+def test_a_broken_scene_is_one_sentence(own_scene, tmp_path, monkeypatch, capsys, corrupt, expected) -> None:
+    corrupt(own_scene)
     assert fidelity(monkeypatch, "run", "--scene", own_scene, "--out", tmp_path / "out") == 2
     said = capsys.readouterr().err.strip()
-    assert said.startswith(f"error: {expected}")
+    assert said.startswith(f"error: {own_scene}{expected}")
     assert "\n" not in said
     assert not (tmp_path / "out").exists()
 
 
-def test_a_fit_recording_that_the_builder_did_not_read_is_refused(
-    scene, recording, tmp_path, monkeypatch, capsys
-) -> None:
+def test_a_fit_recording_of_another_builder_is_refused(scene, recording, tmp_path, monkeypatch, capsys) -> None:
     words = ("--fit-recording", recording[0], "--fit-trajectory", recording[1])
     assert fidelity(monkeypatch, "run", "--scene", scene, *words, "--out", tmp_path / "out") == 2
     assert "held_out.bag: is not what" in capsys.readouterr().err

@@ -11,10 +11,11 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from benchmarks.fidelity.candidate import MANIFEST_SCHEMA, Bore, Candidate, Track
+from benchmarks.fidelity.candidate import Bore, Candidate, Track
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.meshes import concatenate_meshes
 from benchmarks.fidelity.references import PARTS, Hold, Truth
+from scene.inputs import MANIFEST_SCHEMA
 from tests.benchmarks.fidelity.tubemesh import rolled
 from tests.benchmarks.fidelity.tubeshape import Tube
 
