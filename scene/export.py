@@ -22,6 +22,7 @@ from jaxtyping import Float, Int
 from trimesh.visual.material import PBRMaterial
 
 from scene.errors import RecordingError, require_input
+from scene.inputs import read_manifest
 from scene.writing.markup import write_xml
 from scene.writing.mesh import join_meshes
 from subterra_jax.host.command import parse, run_command
@@ -208,13 +209,13 @@ def export(config: ExportConfig) -> Path:
     Raises:
         SubterraError: The scene is missing or damaged, or the output cannot be written.
     """
-    manifest = read_manifest(config.scene)
     endings = _ENDINGS[config.to]
     out = config.out or config.scene.with_name(f"{config.scene.name}{endings[0] if endings else '-sdf'}")
     if endings:
         require_file(out, *endings)
     else:
         require_folder(out, "model.sdf")
+    manifest = read_manifest(config.scene)
     facts = {
         "name": manifest["name"], "provenance": manifest.get("input_provenance", "unknown"), "licence": config.licence,
         "origin": manifest["frame"]["origin"], "crs": manifest["frame"].get("crs") or "not stated",

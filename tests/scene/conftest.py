@@ -60,7 +60,7 @@ def arc_scene(bore, tmp_path_factory) -> tuple[Path, Track, dict[str, int]]:
     laid = lay_track(bore, TrackConfig())
     config = SceneConfig(furniture=FurnitureConfig(passage_spacing=12.0, plate_spacing=8.0))
     count, _ = write_geometry(folder, "arc", "simulated", bore, laid, config)
-    manifest = {"name": "arc", "input_provenance": "simulated", "frame": {"origin": ORIGIN}}
+    manifest = {"schema": "subterra.manifest/1", "name": "arc", "input_provenance": "simulated", "frame": {"origin": ORIGIN}}
     (folder / "manifest.json").write_text(json.dumps(manifest))
     return folder, laid, count
 
