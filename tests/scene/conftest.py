@@ -60,8 +60,8 @@ def arc_scene(bore, tmp_path_factory) -> tuple[Path, Track, dict[str, int]]:
     laid = lay_track(bore, TrackConfig())
     config = SceneConfig(furniture=FurnitureConfig(passage_spacing=12.0, plate_spacing=8.0))
     count, _ = write_geometry(folder, "arc", "simulated", bore, laid, config)
-    manifest = {"schema": "subterra.manifest/1", "name": "arc", "input_provenance": "simulated", "frame": {"origin": ORIGIN}}
-    (folder / "manifest.json").write_text(json.dumps(manifest))
+    one = {"schema": "subterra.manifest/1", "name": "arc", "input_provenance": "simulated", "frame": {"origin": ORIGIN}}
+    (folder / "manifest.json").write_text(json.dumps(one))
     return folder, laid, count
 
 
