@@ -2,9 +2,9 @@
 
 import json
 import multiprocessing
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -227,17 +227,13 @@ def split_recording(recording: Path, out: Path, config: SplitConfig) -> dict[str
     return facts
 
 
-@contextmanager
-def _open_bag(recording: Path) -> Iterator[Any]:
+def _open_bag(recording: Path) -> "closing[Any]":
     try:
         reader = Reader1(recording) if recording.suffix == ".bag" else AnyReader([recording])
         reader.open()
     except Exception as error:
         raise FidelityError(f"{recording}: is no bag that can be split ({error})") from error
-    try:
-        yield reader
-    finally:
-        reader.close()
+    return closing(reader)
 
 
 def _copy_messages(reader: Any, folder: Path, config: SplitConfig, recording: Path) -> dict[str, int]:

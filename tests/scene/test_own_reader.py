@@ -48,13 +48,8 @@ def write_zip(path: Path, scans: list[np.ndarray]) -> Path:
     return path
 
 
-def scans_of(count: int) -> list[np.ndarray]:
-    rng = np.random.default_rng(0)
-    return [rng.uniform(1, 9, (30, 3)).astype(np.float32) for _ in range(count)]
-
-
 def test_a_zip_of_ply_scans_is_read_by_a_file_outside_the_package(reader, tmp_path):
-    points = scans_of(3)
+    points = np.random.default_rng(0).uniform(1, 9, (3, 30, 3)).astype(np.float32)
     load_module(str(reader))
     with Recording(write_zip(tmp_path / "walk.zip", points)) as recording:
         scans = list(recording.scans())

@@ -52,12 +52,6 @@ def case(request):
     return bore, solid, open_lining(solid, bore)
 
 
-def boundary(surface: trimesh.Trimesh) -> np.ndarray:
-    edges, count = np.unique(surface.edges_sorted, axis=0, return_counts=True)
-    assert count.max() <= 2
-    return edges[count == 1]
-
-
 def test_both_libraries_accept_the_solid_as_one_ball(case):
     _, solid, _ = case
     assert solid.is_watertight
@@ -73,7 +67,9 @@ def test_both_libraries_accept_the_solid_as_one_ball(case):
 
 def test_the_lining_has_two_boundary_loops_one_at_either_mouth(case):
     bore, _, lining = case
-    loops = trimesh.graph.connected_components(boundary(lining), min_len=3)
+    edges, count = np.unique(lining.edges_sorted, axis=0, return_counts=True)
+    assert count.max() <= 2
+    loops = trimesh.graph.connected_components(edges[count == 1], min_len=3)
     assert len(loops) == 2
     for loop, end in zip(
         sorted(loops, key=lambda part: bore.axis.local(lining.vertices[part])[0].mean()), (0, -1), strict=True

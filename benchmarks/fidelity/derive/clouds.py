@@ -181,7 +181,8 @@ def voxel_wasserstein(a: VoxelMap, b: VoxelMap) -> tuple[Int[np.ndarray, "v 3"],
     index = {tuple(key): row for row, key in enumerate(b.key)}
     pairs = np.array([(i, index[key]) for i, key in enumerate(map(tuple, a.key)) if key in index]).reshape(-1, 2)
     first, second = pairs.T
-    root = _matrix_root(b.covariance[second])
+    values, axes = np.linalg.eigh(b.covariance[second])
+    root = (axes * np.sqrt(np.maximum(values, 0.0))[:, None, :]) @ axes.transpose(0, 2, 1)
     inner = np.linalg.eigvalsh(root @ a.covariance[first] @ root)
     cross = np.sqrt(np.maximum(inner, 0.0)).sum(axis=1)
     trace = np.trace(a.covariance[first] + b.covariance[second], axis1=1, axis2=2)
@@ -220,11 +221,6 @@ def own_consistency(case: Case) -> float:
     local = returns(case).local
     halves = [voxel_map(local[k::2], MAP_VOXEL) for k in (0, 1)]
     return spatial_consistency(*voxel_wasserstein(*halves))
-
-
-def _matrix_root(matrix: Float[np.ndarray, "v 3 3"]) -> Float[np.ndarray, "v 3 3"]:
-    values, axes = np.linalg.eigh(matrix)
-    return (axes * np.sqrt(np.maximum(values, 0.0))[:, None, :]) @ axes.transpose(0, 2, 1)
 
 
 # Roughness of the wall over half a metre. Medians over patches: a mean depends on the few with an edge.

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
@@ -174,15 +174,10 @@ def point_profile(
     inside = (row >= 0) & (row < len(station))
     cell, radius = (row * count + column)[inside], np.hypot(local[inside, 1], local[inside, 2])
     profile = grouped_median(cell, radius, len(station) * count, LEAST_POINTS).reshape(len(station), count)
-    if floor is not None:
-        profile[:, faces_track(section_angles(count), floor)] = np.nan
+    if floor is not None:  # sectors that look, with any part, where sleepers and rails may stand on it
+        off_nadir = np.abs(_wrap(section_angles(count) + np.pi / 2))
+        profile[:, off_nadir - SECTOR / 2 < np.arctan2(TRACK_HALF, abs(floor))] = np.nan
     return profile
-
-
-def faces_track(angle: Float[np.ndarray, " m"], floor: float) -> Bool[np.ndarray, " m"]:
-    """Return True for sectors that look, with any part, where sleepers and rails may stand on the floor."""
-    off_nadir = np.abs(_wrap(angle + np.pi / 2))
-    return off_nadir - SECTOR / 2 < np.arctan2(TRACK_HALF, abs(floor))
 
 
 def grouped_median(

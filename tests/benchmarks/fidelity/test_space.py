@@ -60,12 +60,6 @@ def test_air_behind_a_wall_is_still_reached_from_the_other_mouth():
 STRAIGHT = Tube(length=6.0, bend=np.inf)
 
 
-def with_box(left):
-    box = trimesh.creation.box((1.0, 1.0, 1.0))
-    box.apply_translation(TUBE.point(6.0, left, -2.4)[0])
-    return replace(judged(), candidate=replace(judged().candidate, extra=box), cache={})
-
-
 def test_rails_keep_the_robot_between_them():
     shown = judged_ground(judged())
     assert not shown.traversable[:, np.abs(np.abs(shown.left) - 0.75) < 0.06].any()
@@ -73,7 +67,9 @@ def test_rails_keep_the_robot_between_them():
 
 
 def test_a_box_between_the_rails_blocks_the_way():
-    case = with_box(0.0)
+    box = trimesh.creation.box((1.0, 1.0, 1.0))
+    box.apply_translation(TUBE.point(6.0, 0.0, -2.4)[0])
+    case = with_extra(box)
     assert measure("nav_path_exists", case).value == 0.0
     assert measure("nav_path_len_ratio", case).failed
     assert measure("nav_blocked_diff", case).value >= 1.0
