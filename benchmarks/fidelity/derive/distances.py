@@ -131,7 +131,9 @@ def _one_way(points: Float[np.ndarray, "n 3"], others: Float[np.ndarray, "m 3"])
 
 M3C2_CORES = 5000
 M3C2_RADIUS = 0.15  # m, of the cylinder
-M3C2_REACH = 0.5  # m along the normal, either way
+# m along the normal, either way. py4dgeo cuts the cylinder into ⌈reach / radius⌉ slabs: an even number of them has a
+# border at the core point, which rounding then counts 0, 1 or 2 times, by the kind of processor.
+M3C2_REACH = 0.7
 M3C2_REGISTRATION = 0.01  # m: what poses that are given to a centimetre leave between two clouds
 
 

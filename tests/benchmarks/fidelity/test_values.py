@@ -14,6 +14,7 @@ import pytest
 
 from benchmarks.fidelity import table
 from benchmarks.fidelity.case import Case
+from benchmarks.fidelity.derive import clouds, distances
 from benchmarks.fidelity.faults import Fault, Site, put_in
 from benchmarks.fidelity.windows.judge import worst_windows
 from tests.benchmarks.fidelity import tube
@@ -64,6 +65,14 @@ def test_every_value_is_what_it_was(known: bool) -> None:
             expected = float(rows[id][key]) if rows[id][key] else None
             assert one == (None if expected is None else pytest.approx(expected, rel=1e-4, abs=1e-7)), (id, key)
         assert str(count) == rows[id]["n"], id
+
+
+def test_no_m3c2_distance_depends_on_how_a_normal_is_rounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    flat = clouds.real_planes(corrupted(True))
+    turned = replace(flat, normal=flat.normal * (1.0 + 3e-16 * np.random.default_rng(0).normal(size=flat.normal.shape)))
+    before = distances.m3c2_distances(corrupted(True)).distance
+    monkeypatch.setattr(distances, "real_planes", lambda case: turned)
+    np.testing.assert_allclose(distances.m3c2_distances(replace(corrupted(True), cache={})).distance, before, atol=1e-9)
 
 
 if __name__ == "__main__":
