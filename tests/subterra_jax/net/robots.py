@@ -22,8 +22,16 @@ def made(id):
     begin = jax.jit(
         lambda key, n: jax.vmap(env.begin, (0, None))(env.draw_reset(key, (n,), params), params), static_argnums=1
     )
-    advance = jax.jit(jax.vmap(env.advance, (0, 0, 0, None)))
-    observe = jax.jit(jax.vmap(env.observe, (0, 0, None)))
+
+    @jax.jit
+    def advance(key, state, action):
+        draws = env.draw_step(key, (len(action),), params)
+        return jax.vmap(env.advance, (0, 0, 0, None))(state, action, draws, params)
+
+    @jax.jit
+    def observe(key, state):
+        return jax.vmap(env.observe, (0, 0, None))(state, env.draw_step(key, state.station.shape, params), params)
+
     return env, params, begin, advance, observe
 
 
@@ -34,27 +42,32 @@ def fresh(id, n, key=0):
 
 def advanced(id, state, action, key=0):
     """States, rewards, flags and infos of all robots after one step of an action, or of one action each."""
-    env, params, _, advance, _ = made(id)
-    n = len(state.station)
-    numbers = jnp.zeros((n, env.action_size)).at[:, : np.shape(action)[-1]].set(jnp.asarray(action))
-    return advance(state, numbers, env.draw_step(jax.random.key(key), (n,), params), params)
+    env, _, _, advance, _ = made(id)
+    numbers = np.zeros((len(state.station), env.action_size), np.float32)
+    numbers[:, : np.shape(action)[-1]] = action
+    return advance(jax.random.key(key), state, numbers)
 
 
 def observed(id, state, key=0):
     """Observations of all robots, by name."""
     env, params, *_, observe = made(id)
-    flat = np.asarray(observe(state, env.draw_step(jax.random.key(key), (len(state.station),), params), params))
+    flat = np.asarray(observe(jax.random.key(key), state))
     return {name: flat[:, part] for name, part in env.fields(params).items()}
 
 
 def placed(id, state, station, lateral=0.0, backward=False):
     """The robots put down elsewhere, along the axis."""
-    station = jnp.broadcast_to(jnp.asarray(station, jnp.float32), state.station.shape)
-    lateral = jnp.broadcast_to(jnp.asarray(lateral, jnp.float32), state.station.shape)
-    x, y, along, across, _ = jax.vmap(at_station, (None, 0), 1)(made(id)[1].tunnel, station)
-    heading = jnp.arctan2(-across, -along) if backward else jnp.arctan2(across, along)
-    position = jnp.stack([x - lateral * across, y + lateral * along], axis=-1)
+    shape = state.station.shape
+    station, lateral = (np.broadcast_to(np.asarray(values, np.float32), shape) for values in (station, lateral))
+    position, heading = _place(made(id)[1].tunnel, station, lateral, np.float32(-1.0 if backward else 1.0))
     return state.replace(position=position, heading=heading, station=station, lateral=lateral)
+
+
+@jax.jit
+def _place(tunnel, station, lateral, way):
+    """Positions and headings along the axis."""
+    x, y, along, across, _ = jax.vmap(at_station, (None, 0), 1)(tunnel, station)
+    return jnp.stack([x - lateral * across, y + lateral * along], axis=-1), jnp.arctan2(way * across, way * along)
 
 
 @functools.partial(jax.jit, static_argnums=0)
