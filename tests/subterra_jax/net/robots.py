@@ -19,9 +19,7 @@ def made(id):
     """A task, its functions for batches of robots compiled once. Faults have the middle of their sizes."""
     middle = {"faults": FaultParams(spread=0.0)} if "Faulted" in id else {}
     env, params = st.make(id, tunnel="subterra-351", **middle)
-    begin = jax.jit(
-        lambda key, n: jax.vmap(env.begin, (0, None))(env.draw_reset(key, (n,), params), params), static_argnums=1
-    )
+    begin = jax.jit(lambda key: jax.vmap(env.begin, (0, None))(env.draw_reset(key, (MANY,), params), params))
 
     @jax.jit
     def advance(key, state, action):
@@ -36,8 +34,19 @@ def made(id):
 
 
 def fresh(id, n, key=0):
-    """States of n robots at the start of their episodes."""
-    return made(id)[2](jax.random.key(key), n)
+    """States of n robots at the start of their episodes, the first of `MANY`."""
+    return jax.tree.map(lambda leaf: leaf[:n], _begun(id, key))
+
+
+@functools.cache
+def _begun(id, key):
+    return jax.device_get(made(id)[2](jax.random.key(key)))
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def known(env, state, params):
+    """What is true of each robot."""
+    return jax.vmap(env.privileged, (0, None))(state, params)
 
 
 def advanced(id, state, action, key=0):
