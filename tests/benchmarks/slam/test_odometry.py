@@ -135,10 +135,15 @@ def test_bag_and_batch_show_one_wall():
     plan = st.tunnel.from_centreline(np.stack([station, np.zeros(131)], axis=-1), 2.8, lidar_height=0.7)
     plan = dataclasses.replace(plan, texture=BATCH_SEED)
     env, params = st.make("Subterra/Traverse-v1", tunnel=plan, sensor="vlp16", intensity=True, texture=1.0)
-    _, state = env.reset(jax.random.key(0), params)
     x = np.mean([k[0] for k in bag]) * 0.05
-    state = state.replace(position=jnp.array([x, 0.0], jnp.float32), station=jnp.float32(x), heading=jnp.float32(0.0))
-    flat = np.asarray(env.observe(state, env.draw_step(jax.random.key(1), (), params), params))
+
+    @jax.jit
+    def look():
+        state = env.begin(env.draw_reset(jax.random.key(0), (), params), params)
+        place = {"position": jnp.array([x, 0.0], jnp.float32), "station": jnp.float32(x), "heading": jnp.float32(0.0)}
+        return env.observe(state.replace(**place), env.draw_step(jax.random.key(1), (), params), params)
+
+    flat = np.asarray(look())
     scan, shown = (flat[env.fields(params)[name]] for name in ("scan", "intensity"))
     rays = np.asarray(params.lidar.directions)
     points = rays * scan[:, None] + (x, 0.0, 0.7)
