@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from subterra_jax.host.command import EXIT_BAD_INPUT, parse, run_command
+from subterra_jax.host.task_ids import BENCHMARK
 from subterra_jax.host.versions import VERSION
 
 # Name: module that it runs, and its meaning. The modules outside this package come with a checkout.
@@ -38,9 +39,7 @@ def main(words: Sequence[str] | None = None) -> int:
     name = parse(_read, words if words[:1] == ["tasks"] else words[:1]).command
     module, _ = COMMANDS[name]
     if not module:
-        from subterra_jax.tasks import list_tasks
-
-        return run_command(lambda: print("\n".join(list_tasks())))
+        return run_command(lambda: print("\n".join(BENCHMARK)))
     root = Path(__file__).resolve().parents[1]
     path = root.joinpath(*module.split("."))
     if not path.with_suffix(".py").is_file() and not path.is_dir():

@@ -57,7 +57,7 @@ def test_the_first_look_finds_both_walls_and_the_angle_between_them(params, angl
 def test_beams_without_echo_and_beams_in_dust_do_not_move_the_walls(params):
     look = jax.jit(steering.track_walls)
     clean = between_walls(2.8, 2.8, 0.0)
-    found = steering.find_walls(jnp.asarray(clean), params)
+    found = jax.jit(steering.find_walls)(jnp.asarray(clean), params)
     for i in range(30):
         corrupted = clean.copy()
         corrupted[(np.arange(6) + i) % 16] = 30.0

@@ -43,11 +43,14 @@ def seen(distance: float, heading: float = 0.0) -> Observed:
     return Observed(jnp.zeros(18), jnp.zeros(16), jnp.float32(distance), jnp.float32(heading))
 
 
+_reckon = jax.jit(reckoning.reckon, static_argnums=(3, 4))
+
+
 def reckon(readings: list[float], speeds: list[float]):
     """Distances reckoned from what the odometer reads, and what is remembered at the end."""
     memory, distances = reckoning.begin_reckoning(seen(0.0)), []
     for reading, speed in zip(readings, speeds, strict=True):
-        step, _, memory = reckoning.reckon(memory, seen(reading), jnp.float32(speed), 0.5, PERIOD)
+        step, _, memory = _reckon(memory, seen(reading), jnp.float32(speed), 0.5, PERIOD)
         distances.append(float(step))
     return distances, memory
 
@@ -171,10 +174,10 @@ def test_an_odometer_weighed_apart_learns_its_error_and_tells_ways_of_other_leng
     assert float(mean[0]) == pytest.approx(0.02 * information / (information + prior), rel=0.01)
     assert float(variance[0]) == pytest.approx(1.0 / (information + prior), rel=0.01)
     assert float(total[0] - total[1]) > 5.0, "a way 10 % longer asks for an odometer four standard deviations off"
-    stands, nothing = weigh_odometer(cloud, step, jnp.zeros(()), jnp.asarray(jnp.nan), motion)
+    stands, nothing = learn(cloud, step, jnp.zeros(()), jnp.asarray(jnp.nan), motion)
     np.testing.assert_array_equal(stands.odometer, cloud.odometer)
     assert not nothing.any()
-    turned, _ = weigh_odometer(cloud, jnp.zeros(()), jnp.zeros(()), jnp.asarray(1.5), motion)
+    turned, _ = learn(cloud, jnp.zeros(()), jnp.zeros(()), jnp.asarray(1.5), motion)
     assert float(turned.odometer[0, 1]) == pytest.approx(float(variance[0]) + 0.02**2 * 1.5 / np.pi, rel=0.01)
 
 

@@ -108,9 +108,10 @@ def test_a_parabola_gives_its_vertex_and_its_curvature():
 
 
 def test_a_bin_that_stands_for_another_place_begins_anew(straight):
-    scan = lidar.scan(straight["smooth"], jnp.array([20.0, 0.0]), jnp.zeros(()), jnp.float32(20.0), BEAMS)
-    once = add_scan(empty_profile(), pose_at(20.0), scan, PARAMS)
-    turned = add_scan(once, pose_at(20.0 + 256 * 0.08), scan, PARAMS)
+    add, place = jax.jit(add_scan), (np.array([20.0, 0.0], np.float32), np.float32(0.0), np.float32(20.0))
+    scan = jax.jit(lidar.scan)(straight["smooth"], *place, BEAMS)
+    once = add(empty_profile(), pose_at(20.0), scan, PARAMS)
+    turned = add(once, pose_at(20.0 + 256 * 0.08), scan, PARAMS)
     np.testing.assert_allclose(turned.count.sum(), once.count.sum())
     assert int(jnp.max(turned.stamp)) > int(jnp.max(once.stamp))
 

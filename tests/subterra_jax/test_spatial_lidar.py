@@ -186,14 +186,15 @@ def test_pixels_are_mixed_at_edges_alone():
     uniform = jax.random.uniform(jax.random.key(0), (n, 2))
     params = echo.EchoParams(mixed=0.25)
     near, ones = jnp.full(n, 5.0), jnp.ones(n)
-    mixed = np.asarray(echo.mix(near, near + 0.5, 0.4 * ones, uniform, params))
+    mix = jax.jit(echo.mix)
+    mixed = np.asarray(mix(near, near + 0.5, 0.4 * ones, uniform, params))
     assert np.mean(mixed != 5.0) == pytest.approx(0.25, abs=0.02)
     assert ((mixed >= 5.0) & (mixed <= 5.5)).all()
     assert np.mean(mixed[mixed != 5.0]) == pytest.approx(5.25, abs=0.02)
     for other, off in ((5.5, 0.02), (6.0, 0.9)):  # one plane met at a slant; an edge that the receiver tells apart
-        assert (np.asarray(echo.mix(near, other * ones, off * ones, uniform, params)) == 5.0).all()
+        assert (np.asarray(mix(near, other * ones, off * ones, uniform, params)) == 5.0).all()
     rays = jnp.asarray(beams.spinning(np.deg2rad(np.linspace(22.5, -22.5, 64)), 16))
-    rim = np.asarray(echo.rim_of(rays, uniform[: len(rays), 0], dataclasses.replace(params, divergence=0.01)))
+    rim = np.asarray(jax.jit(echo.rim_of)(rays, uniform[: len(rays), 0], dataclasses.replace(params, divergence=0.01)))
     np.testing.assert_allclose(np.linalg.norm(rim, axis=1), 1.0, atol=1e-5)
     np.testing.assert_allclose(np.linalg.norm(rim - rays, axis=1), 0.01, rtol=0.01)
 

@@ -123,9 +123,13 @@ def test_two_sweeps_have_the_wall_in_common_by_the_dial(images):
 
 def test_doppler_is_the_speed_of_each_range():
     env, params = st.make(TASK, tunnel=straight(), sensor="spin16x64", doppler=True)
-    state = placed(env, params, 15.0, 0.3, 0.2)
-    drawn = env.draw_step(jax.random.key(1), (), params)
-    state, *_ = env.advance(state, jnp.array([1.5, 0.0]), drawn, params)
+
+    @jax.jit
+    def drive(params):
+        state = placed(env, params, 15.0, 0.3, 0.2)
+        return env.advance(state, jnp.array([1.5, 0.0]), env.draw_step(jax.random.key(1), (), params), params)[0]
+
+    state = drive(params)
     seen = observe(env, state, params)
     cos, sin = np.cos(0.2), np.sin(0.2)
     rays = np.asarray(params.lidar.directions)
@@ -194,29 +198,33 @@ def test_scan_matching_finds_the_shift_by_brightness_alone():
         obs = observed(env, params, flat)
         return pose, obs, scanmatch.log_face(pose, obs, params)
 
+    add, mismatch = (jax.jit(f, static_argnums=3) for f in (scanmatch.add_scan, scanmatch.mismatch))
     faces, cost, plain = scanmatch.empty_profile(), 0.0, 0.0
     walls = scanmatch.empty_profile()
     for k in range(25):
         pose, obs, face = sensing(12.0 + 0.2 * k, k)
-        faces = scanmatch.add_scan(faces, pose, obs.ranges, settings, face)
-        walls = scanmatch.add_scan(walls, pose, obs.ranges, settings)
+        faces, walls = (add(seen, pose, obs.ranges, settings, *f) for seen, f in ((faces, (face,)), (walls, ())))
     for k in range(20):
         pose, obs, face = sensing(18.0 + 0.2 * k, 50 + k)
-        off = dataclasses.replace(pose, station=pose.station + 0.1)
-        cost = cost + scanmatch.mismatch(faces, off, obs.ranges, settings, face)
-        plain = plain + scanmatch.mismatch(walls, off, obs.ranges, settings)
-    found = scanmatch.best_match(cost, settings)
+        off = dataclasses.replace(pose, station=pose.station + np.float32(0.1))
+        cost = cost + mismatch(faces, off, obs.ranges, settings, face)
+        plain = plain + mismatch(walls, off, obs.ranges, settings)
+    found, none = (scanmatch.best_match(total, settings) for total in (cost, plain))
     assert bool(found.informative)
     assert float(found.shift) == pytest.approx(-0.1, abs=0.03)
-    assert not bool(scanmatch.best_match(plain, settings).informative)
+    assert not bool(none.informative)
 
 
 def test_brightness_makes_further_sides_for_the_learnt_localiser():
     env, params = st.make(TASK, tunnel=straight(), intensity=True)
-    flat = env.observe(placed(env, params, 20.0), env.draw_step(jax.random.key(3), (), params), params)
-    obs = observed(env, params, flat)
-    walls = CentreLine().begin(obs, params)
-    points, _ = bends.look(jnp.zeros(()), obs, walls, jnp.zeros(()), params)
+
+    @jax.jit
+    def look(params):
+        flat = env.observe(placed(env, params, 20.0), env.draw_step(jax.random.key(3), (), params), params)
+        obs = observed(env, params, flat)
+        return bends.look(jnp.zeros(()), obs, CentreLine().begin(obs, params), jnp.zeros(()), params)[0]
+
+    points = look(params)
     assert points.n_sides == strips.n_sides(params.lidar) == 4
     assert bool(points.seen[2:].any())
     shown = np.asarray(points.out[2:])[np.asarray(points.seen[2:])]

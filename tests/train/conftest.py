@@ -2,8 +2,10 @@ import gc
 import json
 import os
 import sys
+from functools import partial
 from pathlib import Path
 
+import jax
 import pytest
 from filelock import FileLock
 from jaxtyping import install_import_hook
@@ -31,6 +33,12 @@ def call(main, *arguments: str) -> int:
     finally:
         sys.argv = before
     return caught.value.code
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def weights_of(driver, seed: int, more: float = 0.0):
+    """Fresh weights of a network, and something added to each, by one program."""
+    return jax.tree.map(lambda leaf: leaf + more, driver.init(jax.random.PRNGKey(seed)))
 
 
 @pytest.fixture(scope="session")

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
+from tests.train.conftest import weights_of
 from train import checkpoint, curve, folder, session, sinks, snapshot
 from train.checkpoint import CheckpointError
 from train.config import ConfigError, TrainConfig
@@ -29,7 +30,7 @@ FACTS = {"task": TASK}
 def policy_of(seed, hidden=16):
     env, params = st.make(TASK)
     driver = Driver(env, make_layout(env, params, TrainConfig(hidden=(hidden,))))
-    return Policy(driver.init(jax.random.PRNGKey(seed)))
+    return Policy(weights_of(driver, seed))
 
 
 def like(hidden=16):

@@ -14,6 +14,7 @@ from subterra_jax.baselines.stations import OdometerCount
 from subterra_jax.policies import inputs
 from subterra_jax.policies.memories import Given, Memory
 from subterra_jax.rules import GoalParams
+from tests.train.conftest import weights_of
 from train.config import TrainConfig
 from train.driver import Driver, Policy
 from train.policies import begin_with, make_agent
@@ -55,7 +56,7 @@ def train_and_drive(plan, task, config, localiser=None):
         kept = agent.begin(None, observed(env, params, flat), params)
         return seen, jax.lax.scan(read, kept, (acted, states))[1]
 
-    policy = Policy(jax.tree.map(lambda x: x + 0.01, driver.init(jax.random.PRNGKey(0))), localiser)
+    policy = Policy(weights_of(driver, 0, 0.01), localiser)
     agent = make_agent(driver, policy)
     agent.try_out()
     seen, read = jax.jit(lambda params, policy: run(params, policy, agent))(params, policy)
@@ -77,9 +78,14 @@ def test_training_and_driving_read_equal_numbers(plan, task):
 @pytest.mark.parametrize("task", GOAL_TASKS)
 def test_the_way_to_go_is_the_true_one_but_for_the_odometer_and_the_start_that_is_given(plan, task):
     env, params = st.make(f"Subterra/{task}", tunnel=plan)
-    starts = jax.jit(jax.vmap(env.reset, (0, None)))(jax.random.split(jax.random.key(0), 32), params)
-    way = jax.vmap(lambda flat: way_at_start(env, params, flat))(starts[0])
-    truth = jax.vmap(lambda state: env.privileged(state, params)["to_goal"])(starts[1])
+
+    @jax.jit
+    @jax.vmap
+    def start(key):
+        flat, state = env.reset(key, params)
+        return way_at_start(env, params, flat), env.privileged(state, params)["to_goal"]
+
+    way, truth = start(jax.random.split(jax.random.key(0), 32))
     np.testing.assert_allclose(way, truth, atol=0.5)
     assert np.median(truth) > 20.0
 
@@ -151,7 +157,7 @@ def test_a_filter_on_the_map_reports_what_it_believes_in_training_as_in_driving(
     learner = make_learner(world, config)
     env, params, driver = world.env, world.params, learner.driver
     assert (driver.layout.shape.n_action, env.action_size) == (2, 5)
-    policy = Policy(driver.init(jax.random.PRNGKey(0)))
+    policy = Policy(weights_of(driver, 0))
     agent = make_agent(driver, policy).with_map(params)
     policies.check_fits(agent, env, params, "mine")
 

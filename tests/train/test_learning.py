@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +12,7 @@ import pytest
 import subterra_jax as st
 from subterra_jax.rules import GoalParams, Traverse
 from tests.subterra_jax.tunnels import write_corridor
+from tests.train.conftest import weights_of
 from train import curve
 from train.config import TrainConfig
 from train.driver import Driver, Policy
@@ -68,7 +70,7 @@ def test_what_pays_becomes_likelier(tunnel):
 def test_robots_whose_truth_alone_differs_read_and_do_the_same_and_are_asked_for_something_else(world):
     env, params = world.env, world.params
     driver = Driver(env, make_layout(env, params, TrainConfig(hidden=(8,), memory="gru", cell=8, auxiliary=True)))
-    policy = Policy(driver.init(jax.random.PRNGKey(0)))
+    policy = Policy(weights_of(driver, 0))
     drive = begin(env, driver, policy, params, jax.random.PRNGKey(1), 2)
     further = dataclasses.replace(drive.env_state, station=drive.env_state.station + 5.0)
     unroll = jax.jit(lambda drive: collect(env, driver, policy, params, drive, jax.random.PRNGKey(2), 1)[1])
@@ -111,8 +113,11 @@ def finished(done, coverage, success, episode_return, length):
     return Finished(*(jnp.asarray(x) for x in (done, coverage, success, ~success, episode_return, length)))
 
 
+reported = jax.jit(lambda unroll: report(unroll, {}, None))
+
+
 def add(window, unroll, step):
-    ((ended, _),) = fetch(report(unroll, {}, None))
+    ((ended, _),) = fetch(reported(unroll))
     return window.add(ended, step, unroll.done.shape[1])
 
 
@@ -146,6 +151,7 @@ def test_the_window_holds_exactly_the_last_hundred_episodes():
     assert window.count == len(every) > 200
 
 
+@partial(jax.jit, static_argnums=1)
 def in_parts(unroll, n_parts):
     """The report of an unroll whose environments are shared out over devices."""
     if n_parts == 1:

@@ -116,7 +116,7 @@ def test_the_localiser_learns_ever_more_slowly_down_to_a_fiftieth(monkeypatch):
     up = lambda weights, part: ((jnp.zeros(()), {}), jax.tree.map(jnp.ones_like, weights))  # noqa: E731
     monkeypatch.setattr(learner, "_gradients", up)
     monkeypatch.setattr(localiser, "record_drives", lambda *_: jnp.zeros(2))
-    before = dataclasses.replace(learner.init(jax.random.PRNGKey(0)), steps=jnp.int32(1000))
+    before = dataclasses.replace(jax.jit(learner.init)(jax.random.PRNGKey(0)), steps=jnp.int32(1000))
     bias = lambda state: float(state.weights["out"]["bias"][0])  # noqa: E731
     learn = jax.jit(lambda iteration: learner.learn(before, None, ROVER, jax.random.PRNGKey(1), iteration)[0])
     moved = [bias(before) - bias(learn(iteration)) for iteration in (0, 5, 10)]
@@ -136,7 +136,7 @@ def test_what_the_map_tells_is_added_to_the_localisers_loss(monkeypatch):
 def test_a_wrong_map_is_of_a_place_at_least_50_m_away():
     tunnel = SimpleNamespace(count=1, length=jnp.float32(300.0))
     drive = SimpleNamespace(start=jnp.linspace(0.0, 250.0, 4000), tunnel=jnp.zeros(4000, jnp.int32))
-    given = map_target.draw_cases(jax.random.key(0), drive, SimpleNamespace(tunnel=tunnel))
+    given = jax.jit(lambda key: map_target.draw_cases(key, drive, SimpleNamespace(tunnel=tunnel)))(jax.random.key(0))
     wrong, away = ~np.asarray(given.right), np.abs(np.asarray(given.shift))
     assert np.mean(wrong) == pytest.approx(0.2, abs=0.02)
     assert np.mean(np.asarray(given.sigma) > 0.0) == pytest.approx(0.5, abs=0.03)

@@ -15,7 +15,7 @@ from subterra_jax.baselines.agent import observed
 from subterra_jax.evaluation import evaluate as drive
 from subterra_jax.evaluation import listed_episodes
 from subterra_jax.rules import StartParams
-from tests.train.conftest import TASK, call
+from tests.train.conftest import TASK, call, weights_of
 from train import evaluate, release
 from train.config import ConfigError, TrainConfig
 from train.driver import Driver, Policy, Seen
@@ -31,7 +31,7 @@ GOAL_TASK = "Subterra/StopAtShort-v1"
 def gru():
     env, params = st.make(GOAL_TASK, tunnel="open:cast:train:0")
     driver = Driver(env, make_layout(env, params, TrainConfig(hidden=(12,), memory="gru", cell=12, auxiliary=True)))
-    weights = jax.tree.map(lambda x: x + 0.05, driver.init(jax.random.PRNGKey(1)))
+    weights = weights_of(driver, 1, 0.05)
     return env, params, driver, Policy(weights)
 
 
@@ -124,7 +124,7 @@ def test_a_localiser_begins_from_a_policy_that_has_none_and_drives_as_it_does(tm
     world = open_world("StopAtShort-v1", "open:cast:train:0")
     kept = TrainConfig(memory="stack", frames=frames, hidden=(8,))
     driver, file = make_learner(world, kept).driver, tmp_path / "stack.safetensors"
-    weights = driver.init(jax.random.PRNGKey(0))
+    weights = weights_of(driver, 0)
     write_tensors(file, driver.kind, driver.layout, driver.tensors(Policy(weights)), {"task": GOAL_TASK, "world": {}})
     own = dataclasses.replace(kept, memory="along", walls=walls, begin_from=f"{file},locate-transformer")
     learner = make_learner(world, own)
@@ -154,7 +154,7 @@ def test_another_period_beams_and_fields_are_refused_with_both_sides_named(condi
     trained_under = policies.Conditions.from_facts({"task": TASK, "trained_under": conditions})
     env, params = st.make(TASK)
     driver = Driver(env, make_layout(env, params, TrainConfig(hidden=(4,))))
-    agent = make_agent(driver, Policy(driver.init(jax.random.PRNGKey(0))), conditions=trained_under)
+    agent = make_agent(driver, Policy(weights_of(driver, 0)), conditions=trained_under)
     with pytest.raises(policies.PolicyError, match=message):
         policies.check_fits(agent, env, params, "mine")
 
@@ -164,7 +164,7 @@ def straight_driver():
     """A policy that drives straight on at 1 m/s whatever it sees."""
     env, params = st.make(TASK)
     driver = Driver(env, make_layout(env, params, TrainConfig(hidden=(4,))))
-    weights = jax.tree.map(lambda x: 0.0 * x, driver.init(jax.random.PRNGKey(0)))
+    weights = jax.tree.map(np.zeros_like, weights_of(driver, 0))
     # A speed of 1 m/s between -1 and 2 m/s.
     weights["actor"]["out"]["bias"] = jnp.arctanh(jnp.array([2.0 * 2.0 / 3.0 - 1.0, 0.0]))
     return make_agent(driver, Policy(weights))
@@ -215,7 +215,7 @@ def test_an_ablation_takes_away_what_it_names_and_nothing_else():
     fresh = observed(env, params, flat)
     obs = dataclasses.replace(fresh, distance=fresh.distance + 5.0)
     driver = Driver(env, make_layout(env, params, TrainConfig(hidden=(4,))))
-    agent = make_agent(driver, Policy(driver.init(jax.random.PRNGKey(0))))
+    agent = make_agent(driver, Policy(weights_of(driver, 0)))
 
     def reads(agent):
         act = jax.jit(lambda obs: agent.act(None, agent.begin(None, fresh, params), obs, params, None))

@@ -9,7 +9,7 @@ import pytest
 
 import subterra_jax as st
 from tests.subterra_jax.tunnels import write_corridor
-from tests.train.conftest import SMALL, TASK, call, log_without_timing
+from tests.train.conftest import SMALL, TASK, call, log_without_timing, weights_of
 from train import __main__ as navigate
 from train import learning, ppo, session
 from train.config import ConfigError, TrainConfig
@@ -27,7 +27,7 @@ def driven(tunnel):
     """Two unrolls with episodes of thirteen steps, and the same steps taken one by one outside of `collect`."""
     env, params = st.make("Subterra/TraverseShort-v1", tunnel=tunnel, horizon=HORIZON)
     driver = Driver(env, make_layout(env, params, CONFIG))
-    weights = jax.tree.map(lambda x: x + 0.02, driver.init(jax.random.PRNGKey(0)))
+    weights = weights_of(driver, 0, 0.02)
     policy = Policy(weights)
     drive = jax.jit(lambda p: begin(env, driver, policy, p, jax.random.PRNGKey(1), N_ENVS))(params)
     run = jax.jit(lambda p, d, key: collect(env, driver, policy, p, d, key, N_STEPS))
@@ -49,7 +49,7 @@ def driven(tunnel):
 
 def test_the_unrolled_network_answers_as_it_did_step_by_step(driven):
     rollout, driver = driven["rollout"], driven["driver"]
-    out = driver.unroll(driven["policy"].network, rollout.inputs, driven["middle"].memory, rollout.first)
+    out = jax.jit(driver.unroll)(driven["policy"].network, rollout.inputs, driven["middle"].memory, rollout.first)
     np.testing.assert_allclose(driver.log_prob(out, rollout.raw), rollout.log_prob, atol=1e-4)
     np.testing.assert_allclose(out.value, rollout.value, atol=1e-4)
     np.testing.assert_array_equal(np.nonzero(rollout.first)[0], 1)  # the episodes that began within this unroll
@@ -62,18 +62,22 @@ def test_a_truncated_episode_is_valued_at_its_final_observation_and_no_other_is(
     assert not np.any(rollout.terminated)
     assert np.all(np.asarray(rollout.final_value)[~cut] == 0.0)
     # The robots go on from where the clock cut them off: so does what they would have seen next.
-    env, params, driver, policy = (driven[name] for name in ("env", "params", "driver", "policy"))
-    middle = driven["middle"]
-    action = driver.action(rollout.raw[0])
-    key_steps, key_last = jax.random.split(jax.random.PRNGKey(3))
-    key_env = jax.random.split(jax.random.split(key_steps, N_STEPS)[0], 3)[1]
-    noise = env.draw_step(key_env, (N_ENVS,), params)
-    stepped, *_ = jax.vmap(env.advance, (0, 0, 0, None))(middle.env_state, action, noise, params)
-    scan = env.draw_step(key_last, (N_ENVS,), params)
-    observation = jax.vmap(env.observe, (0, 0, None))(stepped, scan, params)
-    _, memory = driver.answer(policy, rollout.inputs[0], middle.memory)
-    kept = driver.take(policy, middle.kept, action, Seen(observation, stepped.tunnel), params)
-    value = driver.answer(policy, driver.inputs(policy, kept), memory)[0].value
+    env, driver = driven["env"], driven["driver"]
+
+    @jax.jit
+    def valued(params, policy, middle, rollout):
+        action = driver.action(rollout.raw[0])
+        key_steps, key_last = jax.random.split(jax.random.PRNGKey(3))
+        key_env = jax.random.split(jax.random.split(key_steps, N_STEPS)[0], 3)[1]
+        noise = env.draw_step(key_env, (N_ENVS,), params)
+        stepped, *_ = jax.vmap(env.advance, (0, 0, 0, None))(middle.env_state, action, noise, params)
+        scan = env.draw_step(key_last, (N_ENVS,), params)
+        observation = jax.vmap(env.observe, (0, 0, None))(stepped, scan, params)
+        _, memory = driver.answer(policy, rollout.inputs[0], middle.memory)
+        kept = driver.take(policy, middle.kept, action, Seen(observation, stepped.tunnel), params)
+        return driver.answer(policy, driver.inputs(policy, kept), memory)[0].value
+
+    value = valued(driven["params"], driven["policy"], driven["middle"], rollout)
     np.testing.assert_allclose(np.asarray(rollout.final_value)[0], value, atol=1e-4)
     assert np.abs(value - rollout.value[1]).max() > 1e-3
 
@@ -125,7 +129,7 @@ class Filling(Driver):
 def test_the_first_iteration_fills_the_statistics_and_only_the_second_learns(driven):
     driver = Filling(driven["env"], driven["driver"].layout)
     learner = Learner(driven["env"], driver, dataclasses.replace(CONFIG, steps=10 * N_ENVS * N_STEPS))
-    states = [learner.init(jax.random.key(0), driven["params"])]
+    states = [jax.jit(learner.init)(jax.random.key(0), driven["params"])]
     iterate = jax.jit(learner.iterate)
     for _ in range(2):
         states.append(iterate(states[-1], driven["params"])[0])
@@ -140,7 +144,7 @@ def test_a_robot_is_told_the_length_of_its_own_tunnel_of_a_stack(tmp_path):
     plans = [write_corridor(tmp_path / f"{length}.npz", length=length) for length in lengths]
     env, params = st.make("Subterra/Traverse-v1", tunnel=plans, horizon=HORIZON)
     driver = Driver(env, make_layout(env, params, CONFIG))
-    policy = Policy(driver.init(jax.random.PRNGKey(0)))
+    policy = Policy(weights_of(driver, 0))
 
     @jax.jit
     def two_steps(params):
