@@ -230,16 +230,20 @@ def test_sleepers_that_nobody_saw_are_said_to_stand_by_the_spacing():
     assert doubt_track(asked, unseen) == doubt_track(lay_track(bore, TrackConfig(), None), SeenTrack()) == []
 
 
-def test_a_gauge_between_faces_that_poses_blur_is_not_measured(monkeypatch):
+@pytest.mark.parametrize(
+    ("blur", "seed", "unasked", "narrow"),
+    [(0.012, 1, ("_FACE_SHARP", "_HEAD_SHARP"), 0.005), (0.027, 4, ("_HEAD_SHARP",), 0.015)],
+)
+def test_a_gauge_between_faces_that_poses_blur_is_not_measured(blur, seed, unasked, narrow, monkeypatch):
     station, lateral, height, upward = low_points("proud")
-    blurred = lateral + np.random.default_rng(1).normal(0.0, 0.012, len(lateral))
+    blurred = lateral + np.random.default_rng(seed).normal(0.0, blur, len(lateral))
     (line,) = rails_seen.find_rails(rails_seen.LowPoints(station, blurred, height, upward))
     assert not line.measured
-    monkeypatch.setattr(rails_seen, "_FACE_SHARP", 1.0)
-    monkeypatch.setattr(rails_seen, "_HEAD_SHARP", 1.0)
+    for limit in unasked:
+        monkeypatch.setattr(rails_seen, limit, 1.0)
     (line,) = rails_seen.find_rails(rails_seen.LowPoints(station, blurred, height, upward))
-    assert line.measured  # all pieces agree
-    assert line.gauge < 1.435 - 0.005
+    assert line.measured  # all pieces agree, on too little
+    assert line.gauge < 1.435 - narrow
 
 
 @pytest.mark.parametrize("blur", [0.03, 0.04])
@@ -251,17 +255,6 @@ def test_rails_that_poses_broaden_are_found_and_have_no_gauge(blur, monkeypatch)
     assert not any(one.measured for one in tracks)
     monkeypatch.setattr(rails_seen, "_NARROW", (9,))
     assert not rails_seen.find_rails(rails_seen.LowPoints(station, blurred, height, upward))
-
-
-def test_heads_too_broad_for_any_rail_show_no_gauge(monkeypatch):
-    station, lateral, height, upward = low_points("proud")
-    blurred = lateral + np.random.default_rng(4).normal(0.0, 0.027, len(lateral))
-    (line,) = rails_seen.find_rails(rails_seen.LowPoints(station, blurred, height, upward))
-    assert not line.measured
-    monkeypatch.setattr(rails_seen, "_HEAD_SHARP", 1.0)
-    (line,) = rails_seen.find_rails(rails_seen.LowPoints(station, blurred, height, upward))
-    assert line.measured  # and 17 mm narrow, in all pieces alike
-    assert line.gauge < 1.435 - 0.015
 
 
 def test_a_cloud_too_thin_to_show_rails_or_blurred_by_its_poses_says_so():

@@ -11,20 +11,8 @@ from subterra_jax.evaluation import Episodes, evaluate
 from subterra_jax.recorder import RecorderConfig, record
 from subterra_jax.recorder.trace import drive
 from tests.subterra_jax import tunnels
-from tests.subterra_jax.net.robots import (
-    FEW,
-    MANY,
-    advanced,
-    assert_covariance,
-    assert_mean,
-    driven,
-    fresh,
-    known,
-    made,
-    observed,
-    placed,
-    stand,
-)
+from tests.subterra_jax.net import robots
+from tests.subterra_jax.net.robots import FEW, MANY
 from tests.subterra_jax.placing import PROBES
 
 WITH_GOAL = tuple(name for name in st.TASKS if "Traverse" not in name)
@@ -42,12 +30,12 @@ LENGTH, MARGIN = 351.05, 40.0  # m: of the tunnel, and between a mouth and start
     ],
 )
 def test_goals_lie_anywhere_in_their_range_from_the_start_and_starts_anywhere_in_the_room_left(id, low, high):
-    state = fresh(id, MANY)
+    state = robots.fresh(id, MANY)
     start, goal = (np.asarray(values, np.float64) for values in (state.goal.reported, state.goal.station))
     way = goal - start
     assert low - 1e-3 <= way.min() < low + 0.01 * (high - low)
     assert high - 0.01 * (high - low) < way.max() <= high + 0.1
-    assert_mean(way, 0.5 * (low + high))
+    robots.assert_mean(way, 0.5 * (low + high))
     share = np.histogram(way, 10, (low - 1e-3, high + 0.1))[0] / len(way)
     assert np.abs(share - 0.1).max() < 4.0 * np.sqrt(0.1 * 0.9 / len(way))
     # The share of the room in front of the start is uniform from 0 to 1, whatever the way.
@@ -55,20 +43,20 @@ def test_goals_lie_anywhere_in_their_range_from_the_start_and_starts_anywhere_in
     before = (start - MARGIN)[room > 5.0] / room[room > 5.0]
     assert before.min() > -0.01
     assert before.max() < 1.01
-    assert_mean(before, 0.5)
-    assert_mean(before**2, 1.0 / 3.0)
+    robots.assert_mean(before, 0.5)
+    robots.assert_mean(before**2, 1.0 / 3.0)
 
 
 @pytest.mark.parametrize("id", ["Subterra/StopAt-v1", "Subterra/Return-v1"])
 def test_robots_start_where_the_task_says(id):
-    state = fresh(id, MANY)
+    state = robots.fresh(id, MANY)
     np.testing.assert_allclose(state.station, state.goal.reported, atol=1e-4)
     lateral = np.asarray(state.lateral, np.float64)
     # Uniform to either side: 0.5 m and 0.1 rad.
-    off_axis = np.arcsin(np.asarray(known(made(id)[0], state, made(id)[1])["heading_sin"]))
+    off_axis = np.arcsin(np.asarray(robots.known(robots.made(id)[0], state, robots.made(id)[1])["heading_sin"]))
     for values, largest in ((lateral, 0.5), (off_axis, 0.1)):
         assert np.abs(values).max() < largest + 1e-5
-        assert_covariance(values, values, largest**2 / 3.0)
+        robots.assert_covariance(values, values, largest**2 / 3.0)
 
 
 def errors_about(tolerance, n):
@@ -80,20 +68,20 @@ def errors_about(tolerance, n):
 @pytest.mark.parametrize("id", WITH_GOAL)
 def test_a_stop_counts_within_1_metre_and_within_25_centimetres_in_the_short_tasks(id):
     tolerance = 0.25 if "Short" in id else 1.0
-    state, report = fresh(id, FEW), None
+    state, report = robots.fresh(id, FEW), None
     error, inside = errors_about(tolerance, FEW)
     if "Relocalise" in id:
-        state = placed(id, state, state.station)
+        state = robots.placed(id, state, state.station)
         report = np.asarray(state.station) + error
     else:
         target = state.goal.station
         if "Return" in id:
-            state, target = advanced(id, placed(id, state, target), np.zeros(2))[0], state.goal.reported
-        state = placed(id, state, target + error)
-    _, _, early, before = stand(id, state, 9 if "Return" not in id else 8, report)
+            state, target = robots.advanced(id, robots.placed(id, state, target), np.zeros(2))[0], state.goal.reported
+        state = robots.placed(id, state, target + error)
+    _, _, early, before = robots.stand(id, state, 9 if "Return" not in id else 8, report)
     assert not before["stopped"].any()
     assert not (early & ~before["contact"]).any()
-    _, _, ended, info = stand(id, state, 10, report)
+    _, _, ended, info = robots.stand(id, state, 10, report)
     free = ~info["contact"]
     assert free.mean() > (0.8 if "Obstructed" in id else 0.999)
     assert ended.all()
@@ -103,18 +91,18 @@ def test_a_stop_counts_within_1_metre_and_within_25_centimetres_in_the_short_tas
 
 def test_a_report_of_the_wrong_direction_is_no_success():
     id = "Subterra/Relocalise-v1"
-    state = fresh(id, FEW)
-    state = placed(id, state, state.station, backward=True)
-    _, _, ended, info = stand(id, state, 10, np.asarray(state.station))
+    state = robots.fresh(id, FEW)
+    state = robots.placed(id, state, state.station, backward=True)
+    _, _, ended, info = robots.stand(id, state, 10, np.asarray(state.station))
     assert ended.all()
     assert not info["success"].any()
 
 
 def test_the_flag_is_raised_within_2_metres_of_the_goal():
     id = "Subterra/Return-v1"
-    state = fresh(id, FEW)
+    state = robots.fresh(id, FEW)
     error, inside = errors_about(2.0, FEW)
-    _, _, _, info = stand(id, placed(id, state, state.goal.station + error), 1)
+    _, _, _, info = robots.stand(id, robots.placed(id, state, state.goal.station + error), 1)
     np.testing.assert_array_equal(info["flag"], inside)
 
 
@@ -128,19 +116,19 @@ def test_the_flag_is_raised_within_2_metres_of_the_goal():
 )
 def test_below_5_centimetres_and_half_a_radian_a_second_is_standing(command, stands):
     id = "Subterra/StopAt-v1"
-    state = placed(id, fresh(id, FEW), 100.0)
+    state = robots.placed(id, robots.fresh(id, FEW), 100.0)
     for k in range(10):
-        state, _, _, _, info = advanced(id, state, command, key=k)
+        state, _, _, _, info = robots.advanced(id, state, command, key=k)
     # The speed that counts is the true one: it slips by 3 %.
     assert np.mean(info["stopped"]) == (1.0 if stands else 0.0)
 
 
 def test_a_robot_that_has_not_reported_within_60_metres_has_failed():
     id, limit = "Subterra/Relocalise-v1", 60.0
-    state, travelled, ended = fresh(id, FEW), np.zeros(FEW), np.zeros(FEW, bool)
+    state, travelled, ended = robots.fresh(id, FEW), np.zeros(FEW), np.zeros(FEW, bool)
     # Back and forth over 20 m: the limit is of the distance, wherever it is driven.
     for k in range(round(limit / 20.0) + 1):
-        state, series = driven(id, placed(id, state, 20.0), 100, key=k)
+        state, series = robots.driven(id, robots.placed(id, state, 20.0), 100, key=k)
         for moved, terminated in zip(series["moved"], series["terminated"], strict=True):
             travelled = np.where(ended, travelled, travelled + moved)
             ended |= terminated > 0.0
@@ -153,11 +141,13 @@ def test_a_robot_that_has_not_reported_within_60_metres_has_failed():
 
 def test_nine_tenths_covered_in_contact_with_a_wall_are_no_success():
     id = "Subterra/Traverse-v1"
-    _, params, *_ = made(id)
+    _, params, *_ = robots.made(id)
     threshold, n = 0.9 * float(params.tunnel.length), FEW
     lateral = np.where(np.arange(n) < n // 2, 0.0, 2.6)  # the walls are 2.8 m away, the robot's radius is 0.4 m
-    state = placed(id, fresh(id, n), threshold - 0.1, lateral).replace(furthest=jnp.full(n, threshold - 0.1))
-    _, _, terminated, truncated, info = advanced(id, state, np.array([2.0, 0.0]))
+    state = robots.placed(id, robots.fresh(id, n), threshold - 0.1, lateral).replace(
+        furthest=jnp.full(n, threshold - 0.1)
+    )
+    _, _, terminated, truncated, info = robots.advanced(id, state, np.array([2.0, 0.0]))
     info = {name: np.asarray(value) for name, value in info.items()}
     np.testing.assert_array_equal(info["contact"], lateral > 0.0)
     assert (info["coverage"] >= 0.9).all()
@@ -190,7 +180,7 @@ def test_neither_evaluation_nor_trace_counts_coverage_in_contact_as_success(bloc
 
 def among_boxes(id, n):
     """Robots at their starts, and boxes as if all had begun at the mouth."""
-    state = fresh(id, n)
+    state = robots.fresh(id, n)
     if "Obstructed" not in id:
         return state
     return state.replace(obstacles=state.obstacles.replace(start=jnp.zeros(n)))
@@ -199,8 +189,8 @@ def among_boxes(id, n):
 def test_where_a_beam_ends_on_a_box_the_robot_would_touch_it():
     id, plain = "Subterra/Obstructed-v1", "Subterra/StopAt-v1"
     station = np.random.default_rng(0).uniform(20.0, 300.0, FEW)
-    state, empty = (placed(name, among_boxes(name, FEW), station) for name in (id, plain))
-    seen, walls = (observed(name, there)["ranges"] for name, there in ((id, state), (plain, empty)))
+    state, empty = (robots.placed(name, among_boxes(name, FEW), station) for name in (id, plain))
+    seen, walls = (robots.observed(name, there)["ranges"] for name, there in ((id, state), (plain, empty)))
     robot, beam = np.nonzero((seen < walls - 0.5) & (seen < 6.0))
     assert len(robot) > 200
     robot, beam = np.resize(robot, FEW), np.resize(beam, FEW)
@@ -212,7 +202,7 @@ def test_where_a_beam_ends_on_a_box_the_robot_would_touch_it():
     def standing_there(name, state):
         there = jax.tree.map(lambda leaf: leaf[robot], state)
         there = there.replace(position=jnp.asarray(hit), station=jnp.asarray(along, jnp.float32))
-        _, _, terminated, _, info = advanced(name, there, np.zeros(2))
+        _, _, terminated, _, info = robots.advanced(name, there, np.zeros(2))
         return np.asarray(terminated), {key: np.asarray(value) for key, value in info.items()}
 
     terminated, info = standing_there(id, state)
@@ -228,7 +218,7 @@ def test_where_a_beam_ends_on_a_box_the_robot_would_touch_it():
 def test_a_robot_that_drives_blindly_among_boxes_runs_into_them():
     contacts = {}
     for id in ("Subterra/StopAt-v1", "Subterra/Obstructed-v1"):
-        _, series = driven(id, placed(id, among_boxes(id, MANY), 10.0), 150)
+        _, series = robots.driven(id, robots.placed(id, among_boxes(id, MANY), 10.0), 150)
         contacts[id] = series["contact"].any(axis=0).mean()
     assert contacts["Subterra/StopAt-v1"] == 0.0
     assert 0.3 < contacts["Subterra/Obstructed-v1"] < 0.99
@@ -236,17 +226,17 @@ def test_a_robot_that_drives_blindly_among_boxes_runs_into_them():
 
 def test_boxes_are_as_many_and_as_large_as_stated():
     id, points = "Subterra/Obstructed-v1", 150
-    _, params, *_ = made(id)
+    _, params, *_ = robots.made(id)
     state, rng, inside = among_boxes(id, MANY), np.random.default_rng(0), np.zeros(MANY)
     for k in range(points):
-        there = placed(id, state, rng.uniform(30.0, 315.0, MANY), rng.uniform(-3.0, 3.0, MANY))
-        inside += np.asarray(advanced(id, there, np.zeros(2), key=k)[4]["clearance"]) == 0.0
+        there = robots.placed(id, state, rng.uniform(30.0, 315.0, MANY), rng.uniform(-3.0, 3.0, MANY))
+        inside += np.asarray(robots.advanced(id, there, np.zeros(2), key=k)[4]["clearance"]) == 0.0
     # One thing in every 15 m: a box of sides U(0.3, 0.8) m, or, in one of the 22 places after the first, the trolley of
     # 2.4 m by 1.2 m. A point within 3 m of the axis lies inside of it with this chance:
     n_places = float(params.tunnel.length) // 15.0 - 1.0
     assert n_places == 22.0
     area = 0.55**2 + (2.4 * 1.2 - 0.55**2) / n_places
-    assert_mean(inside / points, area / (15.0 * 6.0))
+    robots.assert_mean(inside / points, area / (15.0 * 6.0))
 
 
 def probe(name):
@@ -273,9 +263,9 @@ def test_the_recorder_gives_an_agent_what_it_declares_and_no_more(name, tmp_path
 
 def test_the_truth_that_is_handed_out_is_the_truth():
     id = "Subterra/StopAt-v1"
-    env, params, *_ = made(id)
-    state, _ = driven(id, fresh(id, 50), 50)
-    true = known(env, state, params)
+    env, params, *_ = robots.made(id)
+    state, _ = robots.driven(id, robots.fresh(id, 50), 50)
+    true = robots.known(env, state, params)
     np.testing.assert_array_equal(true["station"], state.station)
     np.testing.assert_allclose(true["to_goal"], state.goal.station - state.station, atol=1e-4)
     assert set(env.fields(params)) == {"ranges", "odometry", "goal", "ring_pitch", "start"}
