@@ -43,7 +43,7 @@ def seen(distance: float, heading: float = 0.0) -> Observed:
     return Observed(jnp.zeros(18), jnp.zeros(16), jnp.float32(distance), jnp.float32(heading))
 
 
-_reckon = jax.jit(reckoning.reckon, static_argnums=(3, 4))
+_reckon = jax.jit(reckoning.reckon)
 
 
 def reckon(readings: list[float], speeds: list[float]):
