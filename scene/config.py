@@ -31,7 +31,7 @@ class BuildConfig:
     """Everything a build depends on beside its input."""
 
     name: str = ""  # Name of the tunnel; that of the output folder where not given.
-    date: str = ""  # Day that the manifest states; none: same input, same bytes.
+    date: str = ""  # Day that the manifest states; none: same input, same bytes on one machine.
     provenance: str = "measured"  # Kind of recording, such as `simulated` for a simulated survey.
     reconstruct: ReconstructConfig = field(default_factory=ReconstructConfig)  # Steps from the input to a bore.
     track: TrackConfig = field(default_factory=TrackConfig)  # Standard by which the track is laid.
