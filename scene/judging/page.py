@@ -50,7 +50,7 @@ def draw_plan(bore: Bore, returns: Returns | None) -> str:
         at = place(np.stack([np.interp([station], bore.station, line[:, k]) for k in (0, 1)], axis=1))[0]
         parts.append(f'<text x="{at[0]:.0f}" y="{height - 6:.0f}" text-anchor="middle">{station:g} m</text>')
     north = np.array([0.0, 1.0]) @ rotate
-    parts.append(_arrow(_WIDTH - 25, 28, north))
+    parts.append(_arrow(_WIDTH - 32, 28, north))
     return _svg(_WIDTH, height, parts)
 
 
@@ -165,6 +165,7 @@ border-left:4px solid #2f855a;padding:6px 10px}.key i{display:inline-block;width
 margin:0 4px 0 12px}
 """
 _NO_WARNING = '<p class="good">None: nothing of any size is unexplained, unseen or odd.</p>'
+_NO_RETURNS = '<p class="good">None on its shape and sizes. Nothing was seen between the rings that could be odd.</p>'
 _KEY = (
     '<p class="key"><i style="background:#9aa5b1"></i>on the model<i style="background:#d64545"></i>inside the bore'
     '<i style="background:#2f6fde"></i>behind the wall<i style="background:#c9a227"></i>beyond the ends</p>'
@@ -183,7 +184,7 @@ def render_page(name: str, bore: Bore, judgement: Judgement, content: dict[str, 
         f"<h1>{escape(name)}</h1>",
         f"<p>{bore.length:.2f} m long, {bore.width.mean():.2f} m wide, {bore.height.mean():.2f} m high in the mean. "
         f"{escape(judgement.summary().capitalize())}.</p>",
-        "<h2>Warnings</h2>", *(warnings or [_NO_WARNING]),
+        "<h2>Warnings</h2>", *(warnings or [_NO_WARNING if judgement.returns is not None else _NO_RETURNS]),
         "<h2>Plan</h2>", draw_plan(bore, judgement.returns), _KEY if judgement.returns is not None else "",
         "<h2>Profile</h2>", draw_profile(bore),
     ]  # fmt: skip
