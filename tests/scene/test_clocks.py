@@ -50,6 +50,12 @@ def test_a_lag_is_found_whatever_the_mount(lidar, late):
         assert found - same == pytest.approx(late, abs=1e-3), "as precise between the lags that are tried"
 
 
+def test_a_bias_of_the_gyro_changes_neither_lag_nor_agreement(lidar):
+    turns = turns_of_gyro(gyro(0.03, Rotation.identity()))
+    biased = find_lag(lidar, lambda start, end: turns(start, end) + np.array([0.3, -0.2, 0.4]))
+    np.testing.assert_allclose(biased, find_lag(lidar, turns), atol=1e-6)
+
+
 def test_an_axis_that_the_lidar_hardly_sees_counts_little(lidar):
     off = np.random.default_rng(2).normal(0, 0.3, len(lidar.rate))
     blind = LidarTurns(lidar.start, lidar.end, lidar.rate + np.outer(off, [0.0, 1.0, 0.0]))

@@ -340,3 +340,9 @@ def assert_bright(cloud, off: float) -> None:
     thinned = thin_cloud(picked, 0.002)
     near = cKDTree(XYZ).query(thinned.points + thinned.origin)[1]
     np.testing.assert_allclose(thinned.intensity, BRIGHT["intensity"][near], atol=off)
+
+
+def test_a_mean_of_nothing_is_an_empty_cloud():
+    empty = VoxelMean(0.05).cloud()
+    assert (empty.points.shape, empty.weights.shape, empty.origin.tolist()) == ((0, 3), (0,), [0.0, 0.0, 0.0])
+    assert (empty.returns, empty.voxel, empty.intensity) == (0, 0.05, None)

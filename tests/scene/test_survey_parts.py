@@ -3,7 +3,7 @@
 import pickle
 from concurrent.futures import Future
 from contextlib import ExitStack
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,31 +11,10 @@ from rich.console import Console
 
 from scene.survey import simulate
 from scene.survey.alignment import draw_railway, lay_out
-from scene.survey.bore import draw_bore
-from scene.survey.carrier import IMUS
 from scene.survey.cast import PULSE, Caster, Hits, Loaded, draw_returns, mix_pixels, noise_sigma
 from scene.survey.config import SensorErrors, SurveyConfig
-from scene.survey.furniture import DESIGN, TOLERANCE, draw_sizes
-from scene.survey.lidar import AVIA_POINT_RATE, Lidar, avia, avia_directions, os1, vlp16
+from scene.survey.lidar import Lidar, avia, os1, vlp16
 from scene.survey.mesh import Mesh, Part
-from scene.survey.section import draw_field
-
-
-def rosette(begin: float, duration: float) -> np.ndarray:
-    time = begin + np.arange(round(duration * AVIA_POINT_RATE)) / AVIA_POINT_RATE
-    return avia_directions(time, np.array([0.3, 1.1]))
-
-
-def angles(ray: np.ndarray) -> np.ndarray:
-    return np.rad2deg(np.stack([np.arctan2(ray[:, 1], ray[:, 0]), np.arcsin(ray[:, 2])], axis=-1))
-
-
-def test_the_pattern_fills_its_field_of_view_and_no_more() -> None:
-    ray = rosette(0.0, 2.0)
-    np.testing.assert_allclose(np.linalg.norm(ray, axis=1), 1.0, atol=1e-12)
-    across, upright = abs(angles(ray)).max(axis=0)
-    assert 35.0 < across <= 35.2
-    assert 38.4 < upright <= 38.6
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -50,14 +29,6 @@ def test_the_centreline_bends_as_a_railway_does(seed: int) -> None:
     curvature = np.gradient(alignment.heading(s), 0.1)
     assert 1 / 401 < abs(curvature).max() < 1 / 149
     assert abs(np.diff(curvature)).max() < 1e-4  # no jump from straight to arc
-
-
-def test_a_field_has_the_spread_and_correlation_asked_for() -> None:
-    rng = np.random.default_rng(1)
-    at = np.array([0.0, 10.0])
-    values = np.array([draw_field(rng, 0.05, 10.0).along(at) for _ in range(4000)])
-    assert values.std() == pytest.approx(0.05, rel=0.03)
-    assert np.corrcoef(values.T)[0, 1] == pytest.approx(np.exp(-1.0), abs=0.04)
 
 
 NEAR, FAR = 5.0, 5.3  # m: two walls across the x axis, with an edge at y = 0
@@ -148,46 +119,6 @@ def test_echoes_too_weak_are_lost_and_can_be_kept(lidar: Lidar) -> None:
     assert share(some, far, 2.8 / far) == pytest.approx(0.9, abs=3 * np.sqrt(0.09 / n))
     for place in ((5.0, -0.5), (lidar.range_max + 1, 1.0), (np.inf, 1.0), (0.2, 1.0)):
         assert share(all_kept, *place) == 0.0
-
-
-def test_every_imu_is_mounted_by_a_rotation() -> None:
-    for imus in IMUS.values():
-        for imu in imus:
-            np.testing.assert_allclose(imu.mount.rotation @ imu.mount.rotation.T, np.eye(3), atol=1e-12)
-            assert np.linalg.det(imu.mount.rotation) == pytest.approx(1.0)
-
-
-@pytest.fixture(scope="module")
-def bores():
-    return [draw_bore(np.random.SeedSequence(7), 20.0, "paper", tolerances=on) for on in (False, True)]
-
-
-def test_every_size_is_drawn_within_its_tolerance_and_differs_from_the_design() -> None:
-    drawn = [draw_sizes(np.random.default_rng(seed)) for seed in range(40)]
-    for size in fields(DESIGN):
-        if size.name in TOLERANCE:
-            values = np.array([getattr(one, size.name) for one in drawn])
-            middle = 0.12 if size.name == "pocket_depth" else getattr(DESIGN, size.name)
-            assert (abs(values - middle) <= TOLERANCE[size.name] + 1e-9).all(), size.name
-            assert values.std() > 0.3 * TOLERANCE[size.name], size.name
-    rows = np.array([one.row_depth for one in drawn])
-    assert abs(rows[:, :4] - rows[:, 4:]).min(axis=1).max() > 0.0  # no bore is alike left and right
-
-
-def test_without_tolerances_a_bore_is_as_designed_and_all_other_draws_stay(bores) -> None:
-    designed, built = (bore.furniture for bore in bores)
-    assert designed.sizes == DESIGN
-    assert designed.rail_axis == pytest.approx(0.754)
-    assert designed.joints[0] == built.joints[0]
-    np.testing.assert_array_equal(designed.filled[:12], built.filled[:12])
-    station = np.arange(0.0, 20.0)
-    np.testing.assert_array_equal(bores[0].section.width(station), bores[1].section.width(station))
-
-
-def test_a_rail_is_150_mm_wide_at_its_foot_16_at_its_web_and_73_at_its_head(bores) -> None:
-    across, up = bores[0].furniture.rail_half.T
-    width = 2e3 * np.interp([0.006, 0.045, 0.080, 0.115, 0.160], up, across)
-    np.testing.assert_allclose(width, [150.0, 16.5, 16.5, 16.5, 73.0], rtol=1e-6)
 
 
 class Sending(ExitStack):

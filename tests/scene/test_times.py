@@ -99,6 +99,9 @@ def test_what_the_user_says_of_the_stamp_moves_the_sweeps(tmp_path):
     after = write_convention(tmp_path / "a.bag")
     agree(read(after, time_stamp="start")[0])
     agree(read(after, time_stamp="end")[0], late=-0.098)
+    for said in (None, "start", "end"):  # what nobody says another clock may still decide
+        with Recording(after, times=TimeConfig(time_stamp=said)) as recording:
+            assert recording.convention.guessed == (said is None)
     boot = write_convention(tmp_path / "b.bag", point_times="boot", boot=320.0)
     agree(read(boot, time_stamp="end")[0], late=-0.098)
     scans, _ = read(boot, time_unit="none")

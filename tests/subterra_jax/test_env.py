@@ -1,5 +1,7 @@
 """The environment contract, over every task."""
 
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import jaxtyping
@@ -7,10 +9,14 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
+from subterra_jax.baselines.agent import observed
+from subterra_jax.baselines.registry import make_agent
 from subterra_jax.lidar import LidarParams
 from subterra_jax.parts.obstacles import ObstacleParams
 from subterra_jax.parts.unicycle import VehicleParams
+from tests.recorded import check
 
+VALUES = Path(__file__).with_name("episodes.csv")
 INFO = {"coverage", "station", "lateral", "half_width", "clearance", "contact", "success"}
 # Between them they have every part that a task can have.
 COVERING = {
@@ -82,6 +88,44 @@ def test_observations_lie_inside_their_space(task):
     for k in range(5):
         assert ((obs >= space.low) & (obs <= space.high)).all()
         obs, state, *_ = step(jax.random.key(k), state, forward(env), params)
+
+
+def test_an_episode_is_what_it_was(task, request):
+    """What is sensed, told and rewarded on one way, and all that the state then holds."""
+    env, params, reset, step = task
+    obs, state = reset(jax.random.key(3), params)
+    told = [(obs, jnp.zeros(()), {})]
+    for k in range(12):
+        action = forward(env) * (1.0 - 0.05 * k) + 0.3 * jnp.sin(jnp.arange(env.action_size) + k)
+        obs, state, reward, *_, info = step(jax.random.key(k), state, action, params)
+        told.append((obs, reward, info))
+    seen, rewards, infos = ([one[i] for one in told] for i in range(3))
+    sensed = {name: np.stack([obs[part] for obs in seen]) for name, part in env.fields(params).items()}
+    noted = {name: np.stack([info[name] for info in infos[1:]]) for name in infos[1]}
+    leaves = jax.tree_util.tree_flatten_with_path(state)[0]
+    held = {jax.tree_util.keystr(path, simple=True, separator=" "): np.asarray(leaf, float) for path, leaf in leaves}
+    name = request.node.callspec.params["task"]
+    check(
+        VALUES, f"episode {name}", {"sensed": sensed, "reward": np.stack(rewards), "info": noted, "state": held}, 3e-4
+    )
+
+
+@pytest.mark.parametrize("task", ["Return"], indirect=True)
+@pytest.mark.parametrize("name", ["fused", "scan-matching"])
+def test_an_agent_thinks_what_it_thought(task, name):
+    """Commands and memories of the baselines on one way, of which they do not choose the commands."""
+    env, params, reset, step = task
+    agent, said = make_agent(name, params), []
+    act = jax.jit(lambda key, memory, flat: agent.act(key, memory, observed(env, params, flat), params, None))
+    obs, state = reset(jax.random.key(3), params)
+    memory = agent.begin(jax.random.key(4), observed(env, params, obs), params)
+    for k in range(12):
+        action, memory = act(jax.random.key(k), memory, obs)
+        said.append(action)
+        obs, state, *_ = step(jax.random.key(k), state, forward(env).at[1].set(0.1), params)
+    leaves = jax.tree_util.tree_flatten_with_path(memory)[0]
+    held = {jax.tree_util.keystr(path, simple=True, separator=" "): np.asarray(leaf, float) for path, leaf in leaves}
+    check(VALUES, name, {"said": np.stack(said), "memory": held}, 3e-4)
 
 
 def test_every_leaf_of_the_params_is_a_strong_array_of_32_bits(task):

@@ -14,9 +14,12 @@ from subterra_jax.baselines.agent import observed
 from subterra_jax.baselines.exactscan import ExactParams, cast_beams, exact_likelihood
 from subterra_jax.baselines.registry import make_agent
 from subterra_jax.baselines.scanmatch import (
+    BIN,
+    N_BINS,
     N_SHIFTS,
     AxisPose,
     MatchParams,
+    WallProfile,
     add_scan,
     best_match,
     centre,
@@ -114,6 +117,18 @@ def test_a_bin_that_stands_for_another_place_begins_anew(straight):
     turned = add(once, pose_at(20.0 + 256 * 0.08), scan, PARAMS)
     np.testing.assert_allclose(turned.count.sum(), once.count.sum())
     assert int(jnp.max(turned.stamp)) > int(jnp.max(once.stamp))
+
+
+@pytest.mark.parametrize("seen", [1.0, 4.0])
+def test_a_brightness_counts_by_its_own_spread_and_that_of_the_mean_it_meets(seen):
+    """The cost in closed form: every beam is off by 0.3 of a logarithm at every shift."""
+    index = jnp.arange(N_BINS) + N_BINS * (jnp.arange(N_BINS) < N_BINS // 2)  # bins about station 20.48 m
+    full = jnp.full((2, N_BINS), seen)
+    profile = WallProfile(full * 0.5, full, jnp.broadcast_to(index, (2, N_BINS)), jnp.full((2, N_BINS), -9.0))
+    ranges = jnp.full(16, 5.0)
+    cost = mismatch(profile, pose_at(N_BINS * BIN), ranges, PARAMS, jnp.full(16, 0.8))
+    variance = PARAMS.face_sigma**2 * (1.0 + 1.0 / seen)
+    np.testing.assert_allclose(cost, 16 * 3.0 * np.log1p(0.3**2 / (6.0 * variance)), rtol=1e-5)
 
 
 @pytest.mark.slow

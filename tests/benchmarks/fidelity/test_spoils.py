@@ -1,6 +1,7 @@
 """Every control does to the geometry what its row says."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,11 +10,30 @@ import trimesh
 from benchmarks.fidelity.candidate import Candidate
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.derive.surface import visible_mesh
-from benchmarks.fidelity.faults import KINDS, Site, put_in
-from benchmarks.fidelity.faults.kinds import load_controls
+from benchmarks.fidelity.faults import KINDS, Fault, Site, put_in
+from benchmarks.fidelity.faults.kinds import MESHES, TRACK, load_controls, local_site
 from tests.benchmarks.fidelity import tube
+from tests.recorded import check, figures
+
+VALUES = Path(__file__).with_name("faults.csv")
 
 NO_SCENE = [id for id in load_controls() if id not in ("N01", "N12", "N29", "N30", "N31", "N33")]
+
+
+def contents(case: Case) -> dict[str, Any]:
+    """Geometry and recording of a case by name."""
+    one, heard = case.candidate, case.hold
+    meshes = {name: getattr(one, name) for name in MESHES} | {name: getattr(one.track, name) for name in TRACK}
+    beams = {name: getattr(heard, name) for name in ("range", "origin", "direction", "time")}
+    bore = {f"bore {name}": value for name, value in vars(one.bore).items()}
+    shapes = {name: {"vertices": mesh.vertices, "faces": mesh.faces} for name, mesh in meshes.items()}
+    return {**shapes, **bore, **beams, "rail": one.track.rail, "sleeper": one.track.sleeper}
+
+
+def changes(before: Case, after: Case) -> dict[str, Any]:
+    """Contents of a case that differ from those of another."""
+    old, new = contents(before), contents(after)
+    return {name: value for name, value in new.items() if list(figures(value)) != list(figures(old[name]))}
 
 
 @pytest.fixture(scope="module")
@@ -48,9 +68,17 @@ def test_a_control_changes_something_and_leaves_the_base_alone(base: Case, contr
     np.testing.assert_array_equal(before[2], base.hold.origin)
     assert corrupted.candidate is not base.candidate or corrupted.hold is not base.hold
     assert not corrupted.cache
+    check(VALUES, control, changes(base, corrupted))
     again = corrupt(base, control, load_controls()[control].bold[0])  # the same bytes
     np.testing.assert_array_equal(corrupted.candidate.lining.vertices, again.candidate.lining.vertices)
     np.testing.assert_array_equal(corrupted.hold.range, again.hold.range)
+
+
+@pytest.mark.parametrize(
+    "kind", ["wall", "roof", "floor", "aside", "lift", "rails", "track", "along", "roll", "box", "gauge"]
+)
+def test_a_local_fault_changes_what_it_changed(base: Case, kind: str) -> None:
+    check(VALUES, kind, changes(base, put_in(local_site(base), Fault(kind, 0.04, 6.0, 2.0, 0.5))))
 
 
 def gaps(one: Candidate) -> np.ndarray:

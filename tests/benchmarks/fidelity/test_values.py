@@ -1,10 +1,8 @@
 """Every value of a tube with many faults is what it was, against its truth and by its recording alone (slow).
 
-Whoever changes what a metric measures on purpose writes the table anew, and says why:
-`python -m tests.benchmarks.fidelity.test_values`.
+Whoever changes what a metric measures on purpose writes the table anew, as `tests.recorded` has it, and says why.
 """
 
-import csv
 from dataclasses import asdict, replace
 from functools import cache
 from pathlib import Path
@@ -13,12 +11,14 @@ import numpy as np
 import pytest
 
 from benchmarks.fidelity import table
+from benchmarks.fidelity.candidate import load_candidate
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.derive import clouds, distances
 from benchmarks.fidelity.faults import Fault, Site, put_in
 from benchmarks.fidelity.windows.judge import worst_windows
-from tests.benchmarks.fidelity import tube
-from tests.benchmarks.fidelity.judged import measure
+from tests.benchmarks.fidelity import tube, tubescene
+from tests.benchmarks.fidelity.judged import SHORT, measure
+from tests.recorded import check
 
 TABLE = Path(__file__).with_name("values.csv")
 RIGHT = tube.Tube(length=11.0, bend=90.0)
@@ -40,31 +40,20 @@ def corrupted(known: bool) -> Case:
     return replace(case, fit=fit, truth=case.truth if known else None, cache={})
 
 
-def values(known: bool) -> dict[str, tuple[float | None, float | None, int]]:
+def values(known: bool) -> dict[str, dict[str, float | None]]:
     """Value, upper end of its interval and number of samples by metric; value and place of the worst windows."""
     found = {}
     for id in IN_MEMORY:
         one = measure(id, corrupted(known))
-        found[id] = one.value, one.interval[1] if one.interval else None, one.n
+        found[id] = {"value": one.value, "end": one.interval[1] if one.interval else None, "n": one.n}
     for one in map(asdict, worst_windows(corrupted(known))):
-        found[f"window {one['id']} {one['source']}"] = one["value"], one["start"], round(1e3 * one["judged"])
+        found[f"window {one['id']} {one['source']}"] = {name: one[name] for name in ("value", "start", "judged")}
     return found
-
-
-def written(known: bool) -> dict[str, dict[str, str]]:
-    with TABLE.open(newline="") as file:
-        return {row["id"]: row for row in csv.DictReader(file) if row["known"] == str(known)}
 
 
 @pytest.mark.parametrize("known", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_every_value_is_what_it_was(known: bool) -> None:
-    rows, now = written(known), values(known)
-    assert list(rows) == list(now)
-    for id, (value, end, count) in now.items():
-        for key, one in (("value", value), ("end", end)):
-            expected = float(rows[id][key]) if rows[id][key] else None
-            assert one == (None if expected is None else pytest.approx(expected, rel=1e-4, abs=1e-7)), (id, key)
-        assert str(count) == rows[id]["n"], id
+    check(TABLE, "known" if known else "heard", values(known))
 
 
 def test_no_m3c2_distance_depends_on_how_a_normal_is_rounded(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -75,8 +64,27 @@ def test_no_m3c2_distance_depends_on_how_a_normal_is_rounded(monkeypatch: pytest
     np.testing.assert_allclose(distances.m3c2_distances(replace(corrupted(True), cache={})).distance, before, atol=1e-9)
 
 
-if __name__ == "__main__":
-    with TABLE.open("w", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(("known", "id", "value", "end", "n"))
-        writer.writerows((known, id, *one) for known in (True, False) for id, one in values(known).items())
+def test_what_values_are_made_of_is_what_it_was() -> None:
+    """Kept results of all derivations, which a percentile may hide."""
+    values(True)
+    case = corrupted(True)
+    kept = {**case.cache, **case.hold.cache, **case.truth.cache}
+    results = {".".join(map(str, key)).replace("benchmarks.fidelity.", ""): one for key, one in kept.items()}
+    check(TABLE, "derived", results, 1e-3)
+
+
+@pytest.mark.parametrize("length", [8.0, 14.0])
+def test_where_counts_and_lengths_differ_every_value_is_what_it_was(length: float) -> None:
+    case = tube.case(RIGHT, replace(RIGHT, length=length), beams=1500)
+    rows = table.load()
+    ids = [id for id in IN_MEMORY if rows[id].category in ("CEN", "SEC", "LIN", "TRK", "NAV")]
+    check(TABLE, f"length {length:g}", {id: measure(id, case).value for id in ids})
+
+
+def test_every_value_of_a_scene_in_mujoco_is_what_it_was(tmp_path) -> None:
+    folder = tubescene.write(tmp_path / "tube", SHORT, panels_off=0.03)
+    text = (folder / "scene.xml").read_text()
+    (folder / "scene.xml").write_text(text.replace('name="sleeper_0003"', 'name="plank"'))
+    case = Case(load_candidate(folder))
+    ids = [id for id, row in table.load().items() if row.category == "SCN" and id != "mj_step_rate"]
+    check(TABLE, "scene", {id: measure(id, case).value for id in ids}, 1e-3)

@@ -1,0 +1,50 @@
+"""Models are what they were; drawn tunnels are those that boards and policies were scored on (see `tests.recorded`)."""
+
+from pathlib import Path
+from xml.etree import ElementTree
+
+import mujoco
+import pytest
+
+import subterra_jax as st
+from subterra_jax.b2.model import robot_spec
+from subterra_jax.host.rover import rover_mjcf
+from subterra_jax.physics.ground import read_track
+from subterra_jax.physics.stage import tunnel_world
+from subterra_jax.pictures.stage import Piece, stage_spec
+from subterra_jax.procedural import open_world
+from subterra_jax.procedural.kinds import KINDS
+from tests.recorded import arrays_of, check
+from tests.subterra_jax.test_open_world import name_of
+
+TABLE = Path(__file__).with_name("values.csv")
+ON_A_WALKWAY = (("universal", 5), ("universal", 30), ("cast", 18))  # the plane cuts one, which is the wall there
+
+
+@pytest.mark.parametrize(("kind", "index"), [*((kind, 0) for kind in KINDS), *ON_A_WALKWAY, ("masonry", 7)])
+def test_a_tunnel_is_drawn_as_it_was(kind, index):
+    name = name_of(kind, index)
+    drawn = open_world.draw(name, 40.0)
+    bore = drawn.bore
+    grid = {name: getattr(bore, name) for name in vars(bore) if name not in ("kind", "layers")}
+    plan = open_world.plan(name, length=40.0)
+    told = {"items": drawn.items, "line": drawn.alignment, "grade": drawn.grade, "bore": grid, "shell": plan.shell}
+    check(TABLE, f"{kind}-{index}", {**told, "half_width": plan.half_width, "walls": plan.linings})
+
+
+def whole_world() -> mujoco.MjSpec:
+    plan = st.load_tunnel("subterra-351")
+    return tunnel_world(plan, read_track(plan))
+
+
+MODELS = {
+    "picture": lambda: stage_spec(Piece(st.load_tunnel("metro", solid=True), "pockets", 100.0, 110.0)),
+    "b2": robot_spec,
+    "rover": lambda: mujoco.MjSpec.from_string(ElementTree.tostring(rover_mjcf(), "unicode")),
+    "world": whole_world,
+}
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_model_for_mujoco_is_what_it_was(name):
+    check(TABLE, name, arrays_of(MODELS[name]().compile()))
