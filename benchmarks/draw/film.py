@@ -20,7 +20,6 @@ from matplotlib.patches import Circle
 from matplotlib.transforms import Affine2D
 from PIL import Image
 
-import subterra_jax as st
 from benchmarks.command import BenchmarkError
 from benchmarks.results import write_file
 from subterra_jax import policies
@@ -29,9 +28,9 @@ from subterra_jax.host.task_ids import MISSIONS
 from subterra_jax.parts.spatial_lidar import SENSORS
 from subterra_jax.pictures.camera import TunnelChoice
 from subterra_jax.pictures.renderer import PictureError
+from subterra_jax.recorder.config import open_place
 from subterra_jax.recorder.trace import drive
-from subterra_jax.tasks import MOTIONS, TASKS, find, first_tunnel, is_planar
-from subterra_jax.tunnel.sources import tunnel_of
+from subterra_jax.tasks import TASKS, find
 from subterra_jax.viewer.episode import Drawn, draw
 
 _AHEAD, _ASIDE = 20.0, 4.5  # half sides of what the plan shows, m
@@ -55,7 +54,7 @@ class FilmConfig:
     tunnel: str | None = None  # Tunnel: a name, a file, `open:SPLIT:INDEX`; the task's default if not given.
     agent: str = "locate-transformer"  # Who drives: a written agent, a released policy or a policy's file.
     motion: Literal["wheels", "rover"] = "wheels"  # What moves the robot; `rover`: physics, in MuJoCo's own engine.
-    scene: Path | None = None  # Built scene folder in which a rover or a B2 moves.
+    scene: Path | None = None  # Built scene folder in which the robot moves, in place of a tunnel.
     steps: int | None = None  # Steps at most; the task's horizon if not given.
     sensor: str = SENSORS[0]  # LiDAR.
     seed: int = 0  # Seed of the episode.
@@ -83,21 +82,13 @@ def run(config: FilmConfig) -> None:
 
 def drive_episode(config: FilmConfig) -> tuple[Drawn, float, View | None]:
     """Drives the episode of the settings; returns it, the radius of the robot (m) and what draws a rover, or None."""
-    spatial = not is_planar(config.sensor)
     id = find(config.task, short=True)
-    physics: dict[str, Any] = {} if config.motion == MOTIONS[0] else {"motion": config.motion}
-    if physics or id in MISSIONS:
-        physics |= {"engine": "mujoco", "scene": config.scene}
-    if config.scene is not None and (not physics or config.tunnel is not None):
-        raise BenchmarkError(f"scene = {config.scene} is for a robot by physics, and brings its own tunnel")
-    source = config.tunnel or first_tunnel(id, spatial)
-    plan = st.load_tunnel(source if config.scene is None else tunnel_of(config.scene), solid=spatial)
-    env, params = st.make(id, tunnel=plan if config.scene is None else None, sensor=config.sensor, **physics)
+    world = open_place(id, config.tunnel, config.scene, None, config.sensor, config.motion)
+    env, params = world.env, world.params
     agent = policies.open_agent(config.agent, env, params)
-    if piece := TASKS[id].piece if id in TASKS else None:
-        plan = plan.slice(piece[0], min(piece[1], plan.length - piece[0]))
-    drawn = draw(env, params, plan, drive(env, params, agent, config.seed, steps=config.steps))
-    return drawn, float(params.vehicle.radius), _view(config, env, params, drawn, piece) if physics else None
+    drawn = draw(env, params, world.plan, drive(env, params, agent, config.seed, steps=config.steps))
+    view = None if world.track is None else _view(config, env, params, drawn, TASKS[id].piece if id in TASKS else None)
+    return drawn, float(params.vehicle.radius), view
 
 
 def _view(config: FilmConfig, env: Any, params: Any, drawn: Drawn, piece: Any) -> View | None:

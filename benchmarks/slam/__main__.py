@@ -12,7 +12,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.command import run_main
+from benchmarks.command import BenchmarkError, run_main
 from benchmarks.records import write_records
 from benchmarks.results import environment_facts, png_bytes, write_file
 from benchmarks.slam import board_page, score
@@ -43,7 +43,7 @@ def main(config: ArenaConfig | BoardConfig | ScoreConfig) -> None:
             _progress.print(f"{name}: {result}")
         _write_board(config.out)
     else:
-        scores = score_all(config)
+        scores, refused = score_all(config)
         for doubt in score.doubts(config, scores):
             _progress.print(f"warning: {doubt}", soft_wrap=True)
         if config.out is not None:
@@ -53,6 +53,8 @@ def main(config: ArenaConfig | BoardConfig | ScoreConfig) -> None:
         for row in score.as_rows(scores):
             table.add_row(*row)
         Console(width=190).print(table)
+        if refused:
+            raise BenchmarkError("not scored: " + "; ".join(refused))
 
 
 def _write_board(folder: Path) -> None:

@@ -30,8 +30,8 @@ _NAMES = {
     "texture-smooth-100": "smooth, texture 1", "texture-joints-100": "joints, texture 1",
     "texture-sprayed-100": "sprayed, texture 1", "doppler-smooth": "smooth, Doppler",
 }  # fmt: skip
-# Colour and marker of a program, in every figure; diamonds are ours.
-_STYLES = {name: (plt.get_cmap("tab20")(k % 20), "o" if one.package else "D") for k, (name, one) in
+# Colour and marker of a program, in every figure, so that grey tells them apart; diamonds are ours.
+_STYLES = {name: (plt.get_cmap("tab20")(k % 20), "oP^Xv>p<h*8"[k % 11] if one.package else "D") for k, (name, one) in
            enumerate(PROGRAMS.items())} | {WHEELS: ("0.3", "s")}  # fmt: skip
 _ASIDE = 0.05  # of the distance between two recordings, from one program to the next
 _LEAST = 3e-5  # m per 100 m, lower end of the figure
@@ -156,7 +156,7 @@ def _draw_panel(axes: Axes, board: dict[str, Any], title: str, names: list[str])
         colour, marker = _STYLES.get(program, ("k", "x"))
         place = at + _ASIDE * (k - 0.5 * (len(programs) - 1))
         axes.errorbar(
-            place, middle, [middle - low, high - middle], fmt=marker, ms=4, lw=1.2, capsize=2, color=colour,
+            place, middle, [middle - low, high - middle], fmt=marker, ms=5, lw=1.2, capsize=2, color=colour,
             label=program,
         )  # fmt: skip
     floor = np.maximum([_floor(board, name) for name in names], _LEAST)

@@ -51,6 +51,7 @@ class Score:
     late: float | None = None  # How much later the turns show the estimate's clock to be, s; from 10 ms on
     after: float = 0.0  # Time for which the estimate goes on after the truth's end, s
     program: str = ""  # Name of the folder of estimates
+    straight: bool = False  # The way has no bend by which `se3` could find the roll
 
 
 def score_files(
@@ -89,6 +90,7 @@ def score_files(
         up_rms=rms(parts[:, 2]), drift=100.0 * abs(float(parts[-1, 0])) / distance if distance > 0.0 else None,
         ape=rms(np.linalg.norm(error, axis=1)), ape_turn=rms(np.degrees(turn)),
         reach=reach_of(travelled, parts[:, 0]), late=track.late, after=track.after,
+        straight=_aside(track.true_position) < _STRAIGHT * distance,
     )  # fmt: skip
     return score, parts
 
@@ -97,6 +99,15 @@ LEAST_RATE = 1.0  # poses a second; fewer leave out where a program errs
 LEAST_COVERED = 0.9  # fraction of a recording below which an estimate is none
 REACH_ERROR = 1.0  # m
 _LEAST_AFTER = 1.0  # s after the truth's end that a program may still report
+
+
+_STRAIGHT = 0.01  # RMS distance of the way from its best line, over its length
+
+
+def _aside(position: Float[np.ndarray, "n 3"]) -> float:
+    """Returns the RMS distance of positions from the line that fits them best, m."""
+    spread = np.linalg.svd(position - position.mean(axis=0), compute_uv=False)
+    return float(np.linalg.norm(spread[1:])) / np.sqrt(len(position))
 
 
 def check_rate(estimate: Path, track: Track) -> None:
@@ -162,32 +173,36 @@ class ScoreConfig:
     out: Path | None = None  # Folder for `scores.json` and `scores.md`.
 
 
-def score_all(config: ScoreConfig) -> list[Score]:
-    """Scores every given estimate.
+def score_all(config: ScoreConfig) -> tuple[list[Score], list[str]]:
+    """Scores every given estimate; returns a sentence on each that cannot be scored as well.
 
     Raises:
-        BenchmarkError: No estimate is given, a file is missing or wrong, or a folder has no estimate with known truth.
+        BenchmarkError: No estimate is given or can be scored, or a folder has no estimate with known truth.
     """
     if not config.estimate:
         raise BenchmarkError("estimate must name at least one file or folder")
-    return [score for path in config.estimate for score in _score_path(path, config)]
-
-
-def _score_path(path: Path, config: ScoreConfig) -> list[Score]:
-    if not path.exists():
-        raise BenchmarkError(f"{path}: no such file or folder")
-    pairs = _pairs(path, config.truth) if path.is_dir() else [(path, _find_truth(path, config.truth))]
-    program, scores = path.name if path.is_dir() else path.parent.name, []
-    for estimate, truth in pairs:
-        score, _ = score_files(estimate, truth, axis=config.axis, alignment=config.alignment)
-        scores.append(dataclasses.replace(score, program=program))
-    return scores
+    scores: list[Score] = []
+    refused = []
+    for path in config.estimate:
+        program = path.name if path.is_dir() else path.parent.name
+        for estimate, truth in _pairs(path, config.truth):
+            try:
+                score, _ = score_files(estimate, truth, axis=config.axis, alignment=config.alignment)
+            except BenchmarkError as error:
+                refused.append(str(error))
+            else:
+                scores.append(dataclasses.replace(score, program=program))
+    if not scores:
+        raise BenchmarkError("; ".join(dict.fromkeys(refused)))
+    return scores, refused
 
 
 def doubts(config: ScoreConfig, scores: list[Score]) -> list[str]:
     """Returns a sentence on each file without truth, each drive not handed in, and poses after a truth's end."""
     said = [f"{one.program} on {one.name}: {one.after:.0f} s of poses lie after the truth's end: another drive?"
             for one in scores if one.after > _LEAST_AFTER]  # fmt: skip
+    said += [f"{one.program} on {one.name}: the drive is straight, so `se3` finds no roll: across, up and APE in ° are "
+             "those of any roll" for one in scores if one.alignment == "se3" and one.straight]  # fmt: skip
     for folder in (path for path in config.estimate if path.is_dir()):
         given = {path.stem for path in folder.glob("*.tum")}
         known = {path.parent.name for path in config.truth.glob(f"*/{TRUTH_FILE}")}
@@ -209,6 +224,10 @@ def _find_truth(estimate: Path, truth: Path) -> Path:
 
 
 def _pairs(folder: Path, truth: Path) -> list[tuple[Path, Path]]:
+    if not folder.exists():
+        raise BenchmarkError(f"{folder}: no such file or folder")
+    if not folder.is_dir():
+        return [(folder, _find_truth(folder, truth))]
     if not truth.is_dir():
         raise BenchmarkError(f"{truth}: is no folder, and {folder} is one")
     pairs = [(path, truth / path.stem / TRUTH_FILE) for path in sorted(folder.glob("*.tum"))]

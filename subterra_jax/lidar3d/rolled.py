@@ -55,10 +55,10 @@ def raise_parts(shell: Shell, lining: str) -> tuple[Axis, Triangles, Triangles, 
     if own.radius is not None:
         shell = replace(shell, radius=own.radius)
     wall = _raise_wall(shell, own)
-    return _cut_axis(shell), wall, _raise_bricks(shell.track), _raise_bricks(own.brick)
+    return _cut_axis(shell), wall, raise_bricks(shell.track), raise_bricks(own.brick)
 
 
-def _raise_bricks(brick: Float[np.ndarray, "k 13"]) -> Triangles:
+def raise_bricks(brick: Float[np.ndarray, "k 13"]) -> Triangles:
     """Return bricks as triangles, eight vertices and twelve faces each."""
     first = 8 * np.arange(len(brick))
     return Triangles(brick_corners(brick).reshape(-1, 3), (first[:, None, None] + BOX_FACES).reshape(-1, 3))

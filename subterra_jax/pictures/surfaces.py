@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from subterra_jax.lidar3d.rolled import raise_parts
+from subterra_jax.lidar3d.rolled import raise_bricks, raise_parts
 from subterra_jax.lidar3d.surface import Triangles, join_surfaces
 from subterra_jax.lidar3d.upright import raise_walls
 from subterra_jax.tunnel.plan import TunnelPlan
@@ -125,6 +125,12 @@ def _upright_surfaces(plan: TunnelPlan, lining: str) -> list[Surface]:
     both = join_surfaces([surface, Triangles(surface.vertices, surface.faces[:, ::-1])])
     floor, rolled = np.tile(floor, 2), np.tile(rolled, (2, 1))
     return [_pick("wall", both, ~floor, WALL, rolled), _pick("floor", both, floor, FLOOR, both.vertices[:, :2])]
+
+
+def track_surfaces(shell: Shell) -> list[Surface]:
+    """Return rails and sleepers of a shell within its window; none where it has no track."""
+    surfaces = _track_surfaces(raise_bricks(short_shell(shell, *shell.window).track))
+    return [surface for surface in surfaces if len(surface.triangles.faces)]
 
 
 def _track_surfaces(track: Triangles) -> list[Surface]:

@@ -11,10 +11,11 @@ from subterra_jax.evaluation import listed_episodes
 from subterra_jax.host import rover
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.host.files import require_folder
-from subterra_jax.parts.spatial_lidar import SENSORS
+from subterra_jax.host.task_ids import MISSIONS
 from subterra_jax.state import EnvParams
-from subterra_jax.tasks import MOTIONS, TASKS, find, first_tunnel
+from subterra_jax.tasks import MOTIONS, TASKS, find, first_tunnel, is_planar
 from subterra_jax.tunnel.plan import TunnelPlan
+from subterra_jax.tunnel.sources import named
 from subterra_jax.tunnel_env import TunnelEnv
 
 SensorName = Literal["planar16", "spin16x64", "vlp16", "os1-64", "avia"]
@@ -36,6 +37,7 @@ class RecorderConfig:
         seed: Seed of everything random in the episode.
         episode: Record this one of the task's 500 listed episodes instead (from 0), as the leaderboard drives it.
         tunnel: Tunnel file or name; the first of those that the task has by itself if left out.
+        scene: Scene folder of `scene.build` in its place, whose tunnel is driven; a rover drives on its ground.
         lining: Variant of the walls; `pockets` if left out.
         motion: `wheels`; or `rover`, by physics in MuJoCo's own engine, whose truth pitches and rolls.
         sensor: The robot's own LiDAR: `planar16`, or `spin16x64`, `vlp16`, `os1-64`, `avia` in three dimensions, whose
@@ -52,6 +54,7 @@ class RecorderConfig:
     seed: int = 0
     episode: int | None = None
     tunnel: str | None = None
+    scene: Path | None = None
     lining: str | None = None
     motion: Literal["wheels", "rover"] = "wheels"
     sensor: SensorName = "planar16"
@@ -137,17 +140,39 @@ def open_world(config: RecorderConfig) -> World:
     name = find(config.task, short=True)
     if name not in TASKS:
         raise RecorderError(f"{name} cannot be recorded: the recorder drives robots on wheels")
-    spatial = config.sensor != SENSORS[0]
-    plan = st.load_tunnel(config.tunnel or first_tunnel(name, spatial), solid=spatial)
     try:
-        physics: dict[str, Any] = {} if config.motion == MOTIONS[0] else {"engine": "mujoco"}
-        env, params = st.make(name, plan, config.lining, sensor=config.sensor, motion=config.motion, **physics)
+        return open_place(name, config.tunnel, config.scene, config.lining, config.sensor, config.motion)
     except ValueError as error:
         raise RecorderError(str(error)) from error
-    piece = TASKS[name].piece
-    if piece is not None:
-        plan = plan.slice(piece[0], min(piece[1], plan.length - piece[0]))
-    return World(env, params, plan)
+
+
+def open_place(
+    task: str, tunnel: str | None, scene: Path | None, lining: str | None, sensor: str, motion: str
+) -> World:
+    """Make a task for one robot: by MuJoCo's own engine, and on the ground of the scene, where it has mass.
+
+    Args:
+        task: The whole id.
+        tunnel: Tunnel file or name; the first of those that the task has by itself if left out, with `scene` too.
+        scene: Scene folder, in place of `tunnel`.
+        lining: Variant of the walls; the tunnel's usual one if left out.
+        sensor: Name of the LiDAR.
+        motion: `wheels` or `rover`.
+
+    Raises:
+        SubterraError: A file is missing or wrong.
+        ValueError: The tunnel is too short for the task, or an argument is out of range.
+    """
+    spatial = not is_planar(sensor)
+    plan = st.load_tunnel(named(tunnel, scene) or first_tunnel(task, spatial), solid=spatial)
+    by_physics = motion != MOTIONS[0] or task in MISSIONS
+    physics: dict[str, Any] = {"engine": "mujoco", "scene": scene} if by_physics else {}
+    if motion != MOTIONS[0]:
+        physics["motion"] = motion
+    given = plan if physics.get("scene") is None else None
+    env, params = st.make(task, given, lining, sensor=sensor, **physics)
+    piece = TASKS[task].piece if task in TASKS else None
+    return World(env, params, plan if piece is None else plan.slice(piece[0], min(piece[1], plan.length - piece[0])))
 
 
 def open_agent(config: RecorderConfig, world: World) -> Agent:

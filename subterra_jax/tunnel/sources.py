@@ -27,8 +27,18 @@ from subterra_jax.tunnel.plan import TunnelPlan
 from subterra_jax.tunnel.tunnel import Tunnel, stack
 
 
-def tunnel_of(scene: Path) -> Path:
-    """Return the tunnel file of a scene folder, or the one beside an MJCF file."""
+def named(tunnel: str | Path | None, scene: Path | None) -> str | Path | None:
+    """Return the tunnel that is named, or that of a scene's folder or MJCF file; `None` where neither is.
+
+    Raises:
+        TunnelError: Both are named, or there is no such scene.
+    """
+    if scene is None:
+        return tunnel
+    if tunnel is not None:
+        raise TunnelError("either --scene or --tunnel, not both: a scene brings its own tunnel")
+    if not scene.exists():
+        raise TunnelError(f"{scene}: no such scene folder")
     return (scene if scene.is_dir() else scene.parent) / "tunnel.npz"
 
 

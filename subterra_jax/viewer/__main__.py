@@ -4,7 +4,6 @@ import argparse
 import sys
 import webbrowser
 from pathlib import Path
-from typing import Any
 
 from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
 from subterra_jax.host.errors import MissingLibraryError, SubterraError
@@ -56,13 +55,12 @@ def view(settings: argparse.Namespace) -> None:
         from subterra_jax.viewer.page import write_page
     except ModuleNotFoundError as missing:
         raise MissingLibraryError("subterra_jax.viewer", missing.name or "viser", "viewer") from missing
-    import subterra_jax as st
     from subterra_jax.host.task_ids import MISSIONS, WALK
     from subterra_jax.parts.spatial_lidar import SENSORS
     from subterra_jax.policies import open_agent
+    from subterra_jax.recorder.config import open_place
     from subterra_jax.recorder.trace import drive
-    from subterra_jax.tasks import MOTIONS, TASKS, find, first_tunnel, is_planar
-    from subterra_jax.tunnel.sources import tunnel_of
+    from subterra_jax.tasks import find
     from subterra_jax.viewer.episode import draw
     from subterra_jax.viewer.shapes import planar_shapes
 
@@ -75,31 +73,16 @@ def view(settings: argparse.Namespace) -> None:
         raise SubterraError(f"seed must be 0 to {2**32 - 1}, got {settings.seed}")
     if settings.steps is not None and settings.steps < 1:
         raise SubterraError(f"steps must be at least 1, got {settings.steps}")
-    if settings.scene is not None and settings.tunnel is not None:
-        raise SubterraError("either --scene or --tunnel, not both: a scene brings its own tunnel")
-    if settings.scene is not None and not settings.scene.exists():
-        raise SubterraError(f"{settings.scene}: no such scene folder")
-    source = settings.tunnel or first_tunnel(task, not is_planar(sensor))
-    plan = st.load_tunnel(source if settings.scene is None else tunnel_of(settings.scene), solid=not is_planar(sensor))
-    physics: dict[str, Any] = {} if settings.motion == MOTIONS[0] else {"motion": settings.motion, "engine": "mujoco"}
-    if task in MISSIONS:
-        physics["engine"] = "mujoco"
-    if physics and settings.scene is not None:
-        physics["scene"] = settings.scene
-    given = None if "scene" in physics else plan
-    env, params = st.make(task, tunnel=given, lining=settings.lining, sensor=sensor, **physics)
-    agent = open_agent(settings.driver, env, params)
-    piece = TASKS[task].piece if task in TASKS else None
-    shown = plan if piece is None else plan.slice(piece[0], min(piece[1], plan.length - piece[0]))
-    trace = drive(env, params, agent, settings.seed, steps=settings.steps)
+    world = open_place(task, settings.tunnel, settings.scene, settings.lining, sensor, settings.motion)
+    env, params, plan, lining = world.env, world.params, world.plan, settings.lining or world.plan.default_lining
+    trace = drive(env, params, open_agent(settings.driver, env, params), settings.seed, steps=settings.steps)
     facts = {
         "task": env.id,
         "driver": settings.driver,
-        "tunnel": f"{plan.name}, {settings.lining or plan.default_lining}, {shown.length:.0f} m",
+        "tunnel": f"{plan.name}, {lining}, {plan.length:.0f} m",
         "seed": str(settings.seed),
     }
-    shapes = planar_shapes(shown, settings.lining or plan.default_lining)
-    write_page(out, draw(env, params, shown, trace), shapes, float(params.vehicle.radius), facts)
+    write_page(out, draw(env, params, plan, trace), planar_shapes(plan, lining), float(params.vehicle.radius), facts)
     print(f"{len(trace)} steps, {trace.ended}: {out}")
     if settings.open:
         webbrowser.open(out.resolve().as_uri())

@@ -1,4 +1,4 @@
-"""Walls, floor and furniture of a tunnel in three dimensions, pulled up from its plan; plain arrays."""
+"""Walls, floor and furniture of a tunnel, pulled up from its plan, and its track; plain arrays."""
 
 import dataclasses
 
@@ -6,10 +6,12 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
+from subterra_jax.pictures.surfaces import Surface, track_surfaces
 from subterra_jax.tunnel.plan import TunnelPlan, Wall
 
 Colour = tuple[int, int, int]  # red, green, blue, 0 to 255
 WALL_HEIGHT = 2.6  # m, for looks: a plan holds the walls at one height
+_UNDER_RECESSES = 0.5  # m of floor beyond the walls
 _WALL, _FLOOR, _FURNITURE = (176, 172, 164), (112, 108, 102), (96, 120, 134)
 
 
@@ -46,7 +48,7 @@ class Shape:
 
 
 def planar_shapes(plan: TunnelPlan, lining: str) -> list[Shape]:
-    """Return both walls, the floor and the furniture of one lining.
+    """Return both walls, the floor and the furniture of one lining; rails and sleepers where the plan has a shell.
 
     Raises:
         TunnelError: The tunnel does not have the lining.
@@ -57,7 +59,14 @@ def planar_shapes(plan: TunnelPlan, lining: str) -> list[Shape]:
         _ribbon("right", centreline, walls.right, inward=True),
         _floor(centreline),
     ]
+    if plan.shell is not None:
+        shapes += [_track(surface) for surface in track_surfaces(plan.shell)]
     return [*shapes, _furniture(centreline, walls.furniture)] if len(walls.furniture) else shapes
+
+
+def _track(surface: Surface) -> Shape:
+    red, green, blue = (round(255 * part) for part in surface.colour)
+    return Shape(surface.name, surface.triangles.vertices, surface.triangles.faces, (red, green, blue))
 
 
 def _ribbon(name: str, centreline: Centreline, wall: Wall, *, inward: bool) -> Shape:
@@ -68,7 +77,8 @@ def _ribbon(name: str, centreline: Centreline, wall: Wall, *, inward: bool) -> S
 
 def _floor(centreline: Centreline) -> Shape:
     plan = centreline.plan
-    left, right = (centreline.points_at(plan.station, side * plan.half_width) for side in (1.0, -1.0))
+    half = plan.half_width + _UNDER_RECESSES
+    left, right = (centreline.points_at(plan.station, side * half) for side in (1.0, -1.0))
     return Shape("floor", np.concatenate([left, right]), _strip(len(left))[:, ::-1], _FLOOR)
 
 

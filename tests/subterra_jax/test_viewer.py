@@ -95,6 +95,11 @@ def test_walls_stand_where_the_lining_has_them_and_are_seen_from_within(centreli
     assert not floor.vertices[:, 2].any()
 
 
+def test_rails_and_sleepers_of_a_piece_are_drawn(centreline):
+    *_, rail, sleeper = planar_shapes(st.load_tunnel("subterra-351").slice(100.0, 60.0), "pockets")
+    assert (rail.name, sleeper.name, len(sleeper.faces) // 12) == ("rail", "sleeper", 100)
+
+
 def test_furniture_stands_on_the_ground_where_it_is(plan_of):
     arrays = tunnels.tunnel_arrays(tunnels.straight(60.0))
     arrays["elevation"] = 0.1 * arrays["station"]

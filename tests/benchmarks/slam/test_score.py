@@ -1,6 +1,7 @@
 """The scorer: errors whose size is known, `evo` beside it, and what it refuses."""
 
 import copy
+import json
 
 import numpy as np
 import pytest
@@ -210,6 +211,18 @@ def test_a_bad_estimate_is_one_sentence_and_status_2(tmp_path, capsys, content, 
     assert sentence in output
     assert output.count("\n") == 1
     assert not out.exists()
+
+
+def test_one_bad_file_is_named_and_the_others_are_scored(tmp_path, capsys):
+    time, *poses = line()
+    for name, step in (("few", 400), ("good", 1)):
+        write_tum(tmp_path / "mine" / f"{name}.tum", time[::step], *(each[::step] for each in poses))
+        write_tum(tmp_path / "truth" / name / "lidar.tum", time, *poses)
+    words = f"score --estimate {tmp_path}/mine --truth {tmp_path}/truth --alignment se3 --out {tmp_path}/out"
+    assert command(words.split()) == 2
+    errors = capsys.readouterr().err
+    assert all(words in errors for words in ("not scored", "few.tum: has", "mine on good: the drive is straight"))
+    assert [score["name"] for score in json.loads((tmp_path / "out/scores.json").read_text())["scores"]] == ["good"]
 
 
 def test_a_bad_axis_or_standstill_is_refused(tmp_path):

@@ -1,5 +1,7 @@
 """A robot whose own LiDAR sees in three dimensions, as a recording."""
 
+import shutil
+
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
@@ -12,13 +14,15 @@ from scene.reading.recording import Recording
 from scene.survey.messages import Convention
 from subterra_jax.recorder import RecorderConfig, record
 from subterra_jax.recorder.messages import POINT
+from subterra_jax.tunnel.sources import tunnel_file
 
 
 @pytest.fixture(scope="module")
 def config(tmp_path_factory):
-    out = tmp_path_factory.mktemp("spatial") / "o"
+    scene = tmp_path_factory.mktemp("spatial")
+    shutil.copy(str(tunnel_file("subterra-351")), scene / "tunnel.npz")
     config = RecorderConfig(
-        out=out, task="TraverseShort", tunnel="subterra-351", lining="smooth", sensor="spin16x64", steps=4, every=2
+        out=scene / "o", task="TraverseShort", scene=scene, lining="smooth", sensor="spin16x64", steps=4, every=2
     )
     record(config)
     return config
@@ -39,7 +43,7 @@ def test_its_points_lie_on_the_wall_by_the_true_pose(config):
     assert set(np.unique(rows["ring"])) <= set(range(16))
     elevation = np.rad2deg(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))
     np.testing.assert_allclose(elevation, -15.0 + 2.0 * rows["ring"], atol=0.1)
-    shell = st.load_tunnel(config.tunnel, solid=True).shell
+    shell = st.load_tunnel(config.scene, solid=True).shell
     off = [depth(shell, points, config, lift) for lift in (0.0, 0.5)]
     assert np.median(np.abs(off[0])) < 0.06
     assert np.median(np.abs(off[1])) > 0.1, "half a metre goes unnoticed"
