@@ -107,10 +107,10 @@ def _open(arguments: Command) -> tuple[Any, Any]:
     return st.make(id, motion=arguments.robot, **options)
 
 
-def _drive(arguments: Command, share: int = 0) -> tuple[transfer.Walk, transfer.Row, Any]:
+def _drive(arguments: Command, job: int = 0) -> tuple[transfer.Walk, transfer.Row, Any]:
     env, params = _open(arguments)
     count, levels = params.tunnel.count, np.asarray(env.levels(params))
-    index = np.array_split(np.arange(arguments.robots), arguments.jobs)[share]
+    index = np.array_split(np.arange(arguments.robots), arguments.jobs)[job]
     episodes = Episodes(
         seed=(arguments.seed + index).astype(np.uint32),
         tunnel=(index % count).astype(np.int32),
@@ -182,8 +182,8 @@ def records_of(arguments: Command, figures: dict[str, float]) -> list[Record]:
         stem, _, unit = figure.rpartition("_")
         interval, tolerance = None, 0.1 * abs(value)
         if stem in ("success", "fall", "contact"):
-            share = binomtest(round(value / 100.0 * n), n).proportion_ci(method="wilson")
-            interval = round(100.0 * share.low, 1), round(100.0 * share.high, 1)
+            fraction = binomtest(round(value / 100.0 * n), n).proportion_ci(method="wilson")
+            interval = round(100.0 * fraction.low, 1), round(100.0 * fraction.high, 1)
             tolerance = 100.0 * 1.96 * math.sqrt(0.25 / n)
         records.append(
             measured(

@@ -134,7 +134,7 @@ def _load(path: Path, origin: np.ndarray) -> trimesh.Trimesh:
 
 
 def wall_figures(lining: trimesh.Trimesh, truth: Truth) -> dict[str, float]:
-    """Return the mean distance of the true wall from the mesh, m, and the share within `NEAR`."""
+    """Return the mean distance of the true wall from the mesh, m, and the fraction within `NEAR`."""
     if not len(truth.wall):
         return {}
     origin = np.floor(truth.wall[0])  # coordinates of millions of metres would cost digits
@@ -202,8 +202,8 @@ def end_figures(scene: Path, origin: np.ndarray, truth: Truth) -> dict[str, floa
         first, last = (project_station(point + origin, truth) for point in bore["position"][[0, -1]])
     station = np.sort([first, last])
     covered = np.clip(station, *truth.span)
-    share = float((covered[1] - covered[0]) / (truth.span[1] - truth.span[0]))
-    return {"from": float(station[0]), "to": float(station[1]), "reversed": bool(first > last), "covered": share}
+    fraction = float((covered[1] - covered[0]) / (truth.span[1] - truth.span[0]))
+    return {"from": float(station[0]), "to": float(station[1]), "reversed": bool(first > last), "covered": fraction}
 
 
 def project_station(point: Float[np.ndarray, "3"], truth: Truth) -> float:

@@ -198,8 +198,8 @@ def read_case(drive: Drive, case: Case, path: Path) -> Row:
             error = time_error(drive, case, recording, case.late - (lag or 0.0))
             said = recording.facts["point_times"]
     except Exception as refused:  # a defect is a wrong reason, too
-        share = case.convention.bad_times
-        true = share > _MOST_BAD and "% of the points" in str(refused) and "none of their sweep" in str(refused)
+        fraction = case.convention.bad_times
+        true = fraction > _MOST_BAD and "% of the points" in str(refused) and "none of their sweep" in str(refused)
         return Row(case, "refused, true reason" if true else "refused, other reason", "refused", repr(refused))
     said = f"{said}; clock {lag}, times off by {error:.4f} s"
     if times.kind == "static" and case.convention.point_times in ("constant", "none"):
@@ -355,8 +355,8 @@ def records_of(config: RecordingsConfig, rows: list[Row]) -> list[Record]:
     ids |= {f"taken/{_id(one)}/{_id(other)}": taken[one, other] for one in true for other in _DECIDED.values()}
     records = [measured(f"recordings/{id}", n, "", command, **further) for id, n in ids.items()]
     apart = [1e3 * row.apart for row in rows if row.outcome == "as control"]
-    for name, share in (("median", 0.5), ("largest", 1.0)) if apart else ():
-        value = round(float(np.quantile(apart, share)), 2)
+    for name, fraction in (("median", 0.5), ("largest", 1.0)) if apart else ():
+        value = round(float(np.quantile(apart, fraction)), 2)
         records.append(measured(f"recordings/bore-{name}", value, "mm", command, **{**further, "n": len(apart)}))
     return records
 

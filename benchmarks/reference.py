@@ -93,8 +93,8 @@ def _intersect(segment: np.ndarray, origin: np.ndarray, direction: np.ndarray) -
     a, b = segment[:, :2] - origin, segment[:, 2:] - origin
     side_a = direction[:, 0] * a[:, 1] - direction[:, 1] * a[:, 0]
     side_b = direction[:, 0] * b[:, 1] - direction[:, 1] * b[:, 0]
-    share = side_a / (side_a - side_b)
-    return np.sum((a + share[:, None] * (b - a)) * direction, axis=1)
+    fraction = side_a / (side_a - side_b)
+    return np.sum((a + fraction[:, None] * (b - a)) * direction, axis=1)
 
 
 def clearance(segments: np.ndarray, position: np.ndarray) -> np.ndarray:
@@ -102,8 +102,8 @@ def clearance(segments: np.ndarray, position: np.ndarray) -> np.ndarray:
     start, edge = segments[:, :2], segments[:, 2:] - segments[:, :2]
     nearest = np.empty(len(position))
     for i, p in enumerate(np.asarray(position, np.float64)):
-        share = np.clip(np.sum((p - start) * edge, axis=1) / np.maximum(np.sum(edge * edge, axis=1), 1e-300), 0.0, 1.0)
-        nearest[i] = np.sqrt(np.min(np.sum((start + share[:, None] * edge - p) ** 2, axis=1)))
+        along = np.clip(np.sum((p - start) * edge, axis=1) / np.maximum(np.sum(edge * edge, axis=1), 1e-300), 0.0, 1.0)
+        nearest[i] = np.sqrt(np.min(np.sum((start + along[:, None] * edge - p) ** 2, axis=1)))
     return nearest
 
 

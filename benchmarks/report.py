@@ -147,7 +147,7 @@ def write_report(out: Path, summary: dict[str, Any], truth: Truth) -> Path:
     """
     driven = (
         f"The trained policy drives {summary['task']} in the reconstructed bore. Robot: a skid-steer platform, "
-        "modelled kinematically. Sensor: 16 planar ranges and a drifting odometer. Reward: the paper's, for the share "
+        "modelled kinematically. Sensor: 16 planar ranges and a drifting odometer. Reward: the paper's, for the part "
         "of the tunnel newly covered, less offset from the middle and changes of command."
     )
     learnt = "Coverage of each training episode and their mean of 100."

@@ -238,9 +238,9 @@ def judge(result: Reconstruction, track: Track, config: JudgingConfig) -> Judgem
 
 def blame_poses(warnings: Iterable[Warned]) -> list[Warned]:
     """Return warnings that name nothing in the bore: where clocks or poses are at fault, they scatter the returns."""
-    share = "; the poses, or their clock, scatter them"
+    reason = "; the poses, or their clock, scatter them"
     return [
-        replace(one, text=one.text.partition(", most ")[0] + share) if one.code is Code.UNEXPLAINED else one
+        replace(one, text=one.text.partition(", most ")[0] + reason) if one.code is Code.UNEXPLAINED else one
         for one in warnings
         if one.code is not Code.PLACE
     ]

@@ -50,8 +50,8 @@ class Stage:
         """Goes on from a partial result, and says so."""
         self.done = self._first = self._line_done = done
         self._bars.update(self._task, completed=done)
-        share = f"at {100 * done / self.total:.0f} %" if self.total else f"after {done:,}"
-        print(f"Resumed {share} of {self.name}", flush=True)
+        where = f"at {100 * done / self.total:.0f} %" if self.total else f"after {done:,}"
+        print(f"Resumed {where} of {self.name}", flush=True)
 
     def _line(self) -> None:
         """Prints one line for each tenth of a stage that lasts."""

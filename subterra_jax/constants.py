@@ -3,7 +3,7 @@
 Params take their defaults from here, and `subterra_jax.tasks` the tasks' own figures. Whoever changes one makes another
 benchmark: `tasks.constants_digest` changes with it, stands in every result, and is pinned by a test.
 
-Sources: the paper gives the limits of the two velocities, the beams, range and noise of the LiDAR, the share to cover,
+Sources: the paper gives the limits of the two velocities, the beams, range and noise of the LiDAR, the part to cover,
 the form of Eq. 1 and its terminal reward of 1, and names the odometer's two errors without sizes. It gives neither
 period nor radius of the robot, nor horizon, nor the weights g, c_d and c_s. These and all other figures are ours; those
 of the errors are chosen so that dead reckoning alone fails.

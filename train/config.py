@@ -36,7 +36,7 @@ def not_negative(config: Any, *names: str) -> None:
             raise ConfigError(f"{name} must not be negative, got {getattr(config, name)}")
 
 
-def share(config: Any, *names: str) -> None:
+def fraction(config: Any, *names: str) -> None:
     """Raises `ConfigError` where one of the settings is no fraction."""
     for name in names:
         if not 0.0 <= getattr(config, name) <= 1.0:
@@ -67,7 +67,7 @@ class TrainConfig:
     minibatches: int = 4  # minibatches per pass; each holds whole unrolls of `n_envs / minibatches` environments
     hidden: tuple[int, ...] = (64, 64)  # widths of the hidden layers, of policy and value alike
     cruise: float | None = None  # largest speed of the policy, m/s; None is that of the vehicle
-    standing: float = 0.5  # share of the largest speed by which the range of actions goes below 0, where a robot stands
+    standing: float = 0.5  # by how much of the largest speed the range of actions goes below 0, where a robot stands
     # standard deviation of the untrained policy before the tanh, in units of half the action range
     init_std: float = 0.5
     init_turn: float | None = None  # the same for the yaw rate; left out it is `init_std`
@@ -241,5 +241,5 @@ def check(config: TrainConfig) -> TrainConfig:
     positive(config, "map_cell", "localiser_rate", "learning_rate", "init_std", "max_grad_norm", "clip")
     not_negative(config, "standing", "entropy_weight", "value_weight", "auxiliary_weight", "stop_coverage", "target_kl")
     positive(config, *(name for name in ("init_turn", "last_std", "cruise") if getattr(config, name) is not None))
-    share(config, "discount", "gae_lambda", "last_rate")
+    fraction(config, "discount", "gae_lambda", "last_rate")
     return config

@@ -76,8 +76,8 @@ def write_curve(runs: list[Path], png: Path, lines: Mapping[str, float] = Mappin
     paper = [("coverage", _EPISODE), ("success", _EPISODE)]
     drawn = paper if shown == "coverage" else [("smooth", _STEP), ("smooth", _SECOND)]
     for axes, (name, against) in zip(panels, drawn, strict=True):
-        for (label, share), style in zip(lines.items(), cycle((":", "-.", "--"))):
-            axes.axhline(100.0 * share, ls=style, lw=1.2, color="0.3", zorder=2, label=f"{label}, {100.0 * share:g} %")
+        for (label, level), style in zip(lines.items(), cycle((":", "-.", "--"))):
+            axes.axhline(100.0 * level, ls=style, lw=1.2, color="0.3", zorder=2, label=f"{label}, {100.0 * level:g} %")
         _draw(axes, [run.resolve().name for run in runs], curves, name, against)
     panels[0].legend(loc="lower right" if shown == "coverage" else "center right", fontsize=8)
     with replace_file(png) as fresh:

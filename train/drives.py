@@ -74,8 +74,8 @@ def record_drives(driver: Driver, policy: Policy, params: Any, key: PRNGKeyArray
         row = Record(driven, seen.distance, points), state.station
         out, _ = driver.answer(policy, jax.vmap(read)(kept, seen), driver.start_memory((n_envs,)))
         command = driver.action(driver.sample(out, jax.random.fold_in(keys[4], t)))[:, :2]
-        share = jax.vmap(lambda p: _speed(p, t))(pace)
-        speed = jnp.maximum(command[:, 0], _LEAST * vehicle.speed_max) * share
+        fraction = jax.vmap(lambda p: _speed(p, t))(pace)
+        speed = jnp.maximum(command[:, 0], _LEAST * vehicle.speed_max) * fraction
         command = jnp.where(over[:, None], 0.0, jnp.stack([speed, command[:, 1]], axis=1))
         noise = env.draw_step(jax.random.fold_in(keys[3], t + 1), (n_envs,), params)
         action = jnp.pad(command, ((0, 0), (0, env.action_size - 2)))

@@ -115,8 +115,8 @@ def _cell(value: float | None) -> str:
     return "" if value is None else str(value) if isinstance(value, int) else f"{value:.9g}"
 
 
-def _percent(share: float | None) -> str:
-    return "none yet" if share is None else f"{100.0 * share:.1f} %"
+def _percent(fraction: float | None) -> str:
+    return "none yet" if fraction is None else f"{100.0 * fraction:.1f} %"
 
 
 def _keep_lines(path: Path, count: int) -> None:

@@ -88,19 +88,19 @@ def _plain(name: str) -> str:
 
 
 def _record(id: str, score: Score, cell: Cell, split: str) -> Record:
-    share = lambda value: round(100.0 * value, 1)  # noqa: E731
+    fraction = lambda value: round(100.0 * value, 1)  # noqa: E731
     start = "hidden" if cell["hidden_start"] else "given"
     words = f"--agents {cell['agent']} " + (f"--texture {cell['texture']:g} " if cell.get("texture") else "")
     return Record(
         id=id,
-        value=share(score.success),
+        value=fraction(score.success),
         unit="%",
-        interval=(share(score.low), share(score.high)) if score.n else None,
+        interval=(fraction(score.low), fraction(score.high)) if score.n else None,
         n=score.n or None,
         split=split,
         seed=None,
         command=f"benchmarks.board --tasks {cell['task']} --start {start} {words}--out out/board",
-        tolerance=share(score.high - score.low) / 2.0 if score.n else 0.1,
+        tolerance=fraction(score.high - score.low) / 2.0 if score.n else 0.1,
         **of_facts(cell["facts"]),
     )
 

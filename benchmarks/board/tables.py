@@ -82,9 +82,9 @@ def screen_markdown(cells: Cells, split: str = SPLIT) -> str:
     return markdown_table(("task", *HEADINGS), rows) if rows else ""
 
 
-def percent(share: float | None) -> str:
+def percent(fraction: float | None) -> str:
     """Return a fraction in whole per cent; a dash for None."""
-    return "-" if share is None else f"{100 * share:.0f}"
+    return "-" if fraction is None else f"{100 * fraction:.0f}"
 
 
 def _interval(score: Score) -> str:

@@ -177,7 +177,7 @@ class SplitConfig:
 
     block: float = 2.0  # Length of a block, s.
     guard: float = 0.2  # Left out around every border between parts, s.
-    shares: tuple[float, float, float] = (0.6, 0.2, 0.2)  # Fractions of fit, val and hold.
+    fractions: tuple[float, float, float] = (0.6, 0.2, 0.2)  # Fractions of fit, val and hold.
     seed: int = 0  # Seed of the order of the blocks.
 
 
@@ -187,7 +187,7 @@ def deal_blocks(duration: float, config: SplitConfig) -> Int[np.ndarray, " b"]:
     Blocks are dealt in hands of five, each of which holds the parts in their shares, so that every part sees the whole
     tunnel; the order within a hand is drawn.
     """
-    hand = np.repeat(np.arange(3), np.round(5 * np.asarray(config.shares)).astype(int))
+    hand = np.repeat(np.arange(3), np.round(5 * np.asarray(config.fractions)).astype(int))
     rng = np.random.default_rng(config.seed)
     return np.concatenate([rng.permutation(hand) for _ in range(int(duration / config.block) // len(hand) + 2)])
 

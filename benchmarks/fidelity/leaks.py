@@ -25,9 +25,9 @@ def find_leaks(case: Case, values: dict[str, Value], recorded: str | None = None
         return []
     leaks = [*provenance_leaks(case, recorded), *noise_leaks(case, values)]
     if case.fit is not None:
-        share = duplicate_share(case.hold, case.fit)
-        if share > 0.0:
-            leaks.append(f"{share:.2%} of the held-out points are exact duplicates of points that the builder had")
+        fraction = duplicate_share(case.hold, case.fit)
+        if fraction > 0.0:
+            leaks.append(f"{fraction:.2%} of the held-out points are exact duplicates of points that the builder had")
     return leaks
 
 

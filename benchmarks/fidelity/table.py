@@ -79,7 +79,7 @@ class Metric:
     category: str  # Three letters
     id: str  # Unique name
     definition: str  # Definition in a sentence: the first one of its function's docstring
-    # Unit of value and thresholds. SI: `m`, `1/m`, `1/s`, `1` (a share, ratio or correlation), `bool`, `count`. Not SI,
+    # Unit of value and thresholds. SI: `m`, `1/m`, `1/s`, `1` (fraction, ratio, correlation), `bool`, `count`. Not SI,
     # as surveyors write them: `%`, `deg`, `mm`, `mm/m`, `m/100 m`, `1/100 scans`, `nat`.
     unit: str
     role: str  # `S` scored, `G` scored and a gate, `L` logged

@@ -49,8 +49,8 @@ class Mosaic:
         """Returns the correlation of points with what was seen there; 0 where too little was."""
         place, row = station / CELL - 0.5, _cell_round(angle)
         low = np.floor(place).astype(int)
-        share, total, count = place - low, 0.0, 0.0
-        for column, weight in ((low, 1.0 - share), (low + 1, share)):
+        fraction, total, count = place - low, 0.0, 0.0
+        for column, weight in ((low, 1.0 - fraction), (low + 1, fraction)):
             total = total + weight * self.total[column % _COLUMNS, row]
             count = count + weight * self.count[column % _COLUMNS, row]
         known = np.asarray(count) > 0.5

@@ -210,6 +210,6 @@ def main(words: list[str]) -> int:
         return 1
     turns = Rotation.from_matrix(poses[:, :3, :3])
     save_tum(Trajectory(times, poses[:, :3, 3], turns, words[0]), Path(words[2]))
-    share = seconds / float(times[-1] - times[0])
-    print(json.dumps({"poses": len(times), "seconds": round(seconds, 2), "share": round(share, 3)}))
+    fraction = seconds / float(times[-1] - times[0])
+    print(json.dumps({"poses": len(times), "seconds": round(seconds, 2), "share": round(fraction, 3)}))
     return 0

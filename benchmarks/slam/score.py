@@ -181,8 +181,7 @@ def score_all(config: ScoreConfig) -> tuple[list[Score], list[str]]:
     """
     if not config.estimate:
         raise BenchmarkError("estimate must name at least one file or folder")
-    scores: list[Score] = []
-    refused = []
+    scores, refused = list[Score](), list[str]()
     for path in config.estimate:
         program = path.name if path.is_dir() else path.parent.name
         for estimate, truth in _pairs(path, config.truth):

@@ -82,7 +82,7 @@ def measure(loop: Loop, n_envs: int, timing: Timing) -> Speed:
 def _timed(
     call: Callable[..., Any], key: PRNGKeyArray, carry: Carry, params: Any, n_envs: int
 ) -> tuple[float, Carry, float, float]:
-    """Returns the time of a call, s, the state after it, the sum of its outputs and the share of episodes that end."""
+    """Returns the time of a call, s, the state after it, the sum of its outputs and the fraction of episodes ended."""
     started = perf_counter()
     carry, total, done = jax.block_until_ready(call(key, carry, params))
     elapsed = perf_counter() - started

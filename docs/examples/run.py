@@ -26,7 +26,7 @@ def main() -> None:
     parser.add_argument("trainer", choices=TRAINERS)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--task", default="Subterra/TraverseShort-v1")
-    parser.add_argument("--goal", type=float, default=GOAL, help="share of the fresh episodes")
+    parser.add_argument("--goal", type=float, default=GOAL, help="fraction of the fresh episodes")
     parser.add_argument("--steps", type=int, default=2_000_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--episodes", type=int, default=100, help="listed episodes at the end")

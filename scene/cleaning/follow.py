@@ -169,7 +169,7 @@ _REMEMBERED = 12  # sections in the template
 _RECENT = 3  # sections in the template of a section that changes fast
 _HEADED = 8  # m of way that give the direction
 _ENCLOSED = 0.62  # fraction of the directions matched
-_OPEN = 0.45  # share with any return near the template's size: less is no bore
+_OPEN = 0.45  # fraction with any return near the template's size: less is no bore
 _SIZE = 2.2  # times the template
 _LONGEST_GAP = 15  # m without an enclosing section
 _PULL = 3.0  # bins that the prediction counts for
@@ -313,8 +313,8 @@ def _heading(places: Sequence[np.ndarray], before: np.ndarray) -> np.ndarray:
     centred = at - at.mean(axis=0)
     along = np.arange(len(at)) - (len(at) - 1) / 2
     fitted = along @ centred / (along @ along)
-    share = min(len(at) / _HEADED, 1.0) * 0.5
-    mixed = share * fitted / max(float(np.linalg.norm(fitted)), 1e-9) + (1 - share) * before
+    fraction = min(len(at) / _HEADED, 1.0) * 0.5
+    mixed = fraction * fitted / max(float(np.linalg.norm(fitted)), 1e-9) + (1 - fraction) * before
     return mixed / np.linalg.norm(mixed)
 
 
@@ -328,7 +328,7 @@ def _lay(
 ) -> tuple[np.ndarray, float, float, np.ndarray]:
     """Return how far a section's middle is to the left and above of a place, and the section about it.
 
-    Between them: the fraction of its directions that match either template, and the share that match the longer one.
+    Between them: the fraction of its directions that match either template, and the fraction that match the longer one.
     """
     reach = _SIZE * float(template.max())
     near = points[tree.query_ball_point(position, reach)] - position

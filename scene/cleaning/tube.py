@@ -87,8 +87,8 @@ def measure_tube(
     wide[..., 1:] |= hit[..., :-1]
     wide[..., :-1] |= hit[..., 1:]
     usual, present, brief = (
-        _outermost(wide, hit, window, share)
-        for window, share in ((_USUAL, _MOSTLY), (_PRESENT, _PERSISTENT), (_BRIEF, _PERSISTENT))
+        _outermost(wide, hit, window, fraction)
+        for window, fraction in ((_USUAL, _MOSTLY), (_PRESENT, _PERSISTENT), (_BRIEF, _PERSISTENT))
     )
     usual = bridge_hanging(fill_nearest(fill_sides(usual, grid.angle)), grid.angle)
     wall = _decide(usual, present, brief, wide)
@@ -134,14 +134,14 @@ def _mirrored(
     return result
 
 
-def _outermost(wide: np.ndarray, hit: np.ndarray, window: float, share: float) -> Float[np.ndarray, "rows cols"]:
+def _outermost(wide: np.ndarray, hit: np.ndarray, window: float, fraction: float) -> Float[np.ndarray, "rows cols"]:
     """Outermost distance with returns in enough of the rows seen within `window` m, m; NaN where there is none."""
     size = 2 * round(window / ROW) + 1
     seen = uniform_filter1d(hit.any(axis=2).astype(np.float32), size, axis=0, mode="constant") * size
     result = np.full(hit.shape[:2], np.nan)
     for column in range(hit.shape[1]):
         rows = uniform_filter1d(wide[:, column].astype(np.float32), size, axis=0, mode="constant") * size
-        needed = np.maximum(share * seen[:, column], min(_LEAST_ROWS, size / 4) - 0.01)
+        needed = np.maximum(fraction * seen[:, column], min(_LEAST_ROWS, size / 4) - 0.01)
         enough = (rows >= needed[:, None]) & (rows > 0.5)
         some = enough.any(axis=1)
         last = enough.shape[1] - 1 - enough[:, ::-1].argmax(axis=1)
@@ -166,8 +166,8 @@ def _decide(
     for found in (present, brief):
         known = np.isfinite(found)
         for changed in ((found > usual + _DIFFERENT) & (found < _WIDEST * usual), found < usual - _DIFFERENT):
-            share = changed.sum(axis=1) / np.maximum(known.sum(axis=1), 1)
-            at_once = (share > _AROUND) & (known.mean(axis=1) > _AROUND)
+            fraction = changed.sum(axis=1) / np.maximum(known.sum(axis=1), 1)
+            at_once = (fraction > _AROUND) & (known.mean(axis=1) > _AROUND)
             if found is present:
                 at_once &= _nothing_behind(found, changed, wide)
             cells = at_once[:, None] & changed
@@ -325,10 +325,10 @@ def find_plane_walls(tube: Tube, around: Around) -> Tube:
 
 def _sample(tube: Tube, across: np.ndarray, low: np.ndarray, high: np.ndarray) -> Float[np.ndarray, "k 3"]:
     """Return station, lateral and upward offset of places on a plane wall, m."""
-    share = np.linspace(0.0, 1.0, max(int(np.median(high - low) / _APART), 2))
+    fraction = np.linspace(0.0, 1.0, max(int(np.median(high - low) / _APART), 2))
     stations = np.arange(tube.grid.station[0], tube.grid.station[-1], _APART)
     across, low, high = (np.interp(stations, tube.grid.station, rows)[:, None] for rows in (across, low, high))
-    places = np.broadcast_arrays(stations[:, None], across, low + share * (high - low))
+    places = np.broadcast_arrays(stations[:, None], across, low + fraction * (high - low))
     return np.stack(places, axis=-1).reshape(-1, 3)
 
 

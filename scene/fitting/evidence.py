@@ -127,7 +127,7 @@ _CHANCE = 1e-4  # probability that random stations have a pitch as clear as the 
 _MIN_FILLED = 0.2  # of the places that rows and joints make; a true lining fills most, a staggered one half
 _ROW_APART = 0.25  # m of girth between two rows
 _ALIKE = 0.15  # of the median gap: gaps that differ from it, or from twice it, by less are alike
-_ALIKE_BY_CHANCE = 0.3  # share of alike gaps among random ones; 0.24 where they are 20 cm and an exponential of 40 cm
+_ALIKE_BY_CHANCE = 0.3  # alike of random gaps, as a fraction; 0.24 where they are 20 cm and an exponential of 40 cm
 
 
 def open_rims(
@@ -175,8 +175,8 @@ def pocket_over_wall(sections: Sections, holes: Holes, size: tuple[float, float]
         at = Holes(holes.row + row, holes.column + column, holes.score)
         found, expected, behind, by_chance = (patches(field, at, *reach) for field in fields)
         on_wall = found * np.log(left) + expected * (1 - left)
-        share = 1 - (1 - hollow) * (1 - by_chance)
-        beyond = behind * np.log(share / by_chance) + (1 - behind) * np.log((1 - share) / (1 - by_chance))
+        fraction = 1 - (1 - hollow) * (1 - by_chance)
+        beyond = behind * np.log(fraction / by_chance) + (1 - behind) * np.log((1 - fraction) / (1 - by_chance))
         ratios.append((on_wall + beyond).sum(axis=(1, 2)))
     return np.asarray(logsumexp(ratios, axis=0) - np.log(len(ratios)))
 
@@ -190,10 +190,10 @@ def _wall_around(
     cells[np.clip(holes.row, 0, len(cells) - 1), holes.column % columns] = True
     cells = binary_dilation(np.concatenate([cells] * 3, axis=1), np.ones(_MOUTH))[:, columns : 2 * columns]
     wall = (~cells).astype(float)
-    share = np.maximum(uniform_filter(wall, _EXPECTED, mode=MODES), _LEAST_BEHIND)
+    fraction = np.maximum(uniform_filter(wall, _EXPECTED, mode=MODES), _LEAST_BEHIND)
     seen = (sections.deepest > _BEHIND) * wall
-    points = uniform_filter(sections.support * wall, _EXPECTED, mode=MODES) / share
-    behind = uniform_filter(seen, _EXPECTED, mode=MODES) / share
+    points = uniform_filter(sections.support * wall, _EXPECTED, mode=MODES) / fraction
+    behind = uniform_filter(seen, _EXPECTED, mode=MODES) / fraction
     return np.maximum(points, 0.0), np.clip(behind, _LEAST_BEHIND, 0.5)
 
 
@@ -207,8 +207,8 @@ def _looks_of(
     found, expected, behind, by_chance = (patches(field, clear, *reach).sum(axis=0) for field in fields)
     left = (found + _PRIOR) / (expected + _PRIOR)
     wall = (by_chance + _PRIOR * _LEAST_BEHIND) / (len(clear.row) + _PRIOR)
-    share = (behind + _PRIOR * wall) / (len(clear.row) + _PRIOR)
-    return left, np.clip((share - wall) / (1 - wall), 0.0, None)
+    fraction = (behind + _PRIOR * wall) / (len(clear.row) + _PRIOR)
+    return left, np.clip((fraction - wall) / (1 - wall), 0.0, None)
 
 
 def odds_by_place(
@@ -228,8 +228,8 @@ def odds_by_place(
     odds = ratio
     for _ in range(_ROUNDS):
         total = np.concatenate([[0.0], np.cumsum(np.tile(expit(odds)[order], 3))])
-        share = (total[after] - total[first] + 0.5) / (after - first + 1.0)
-        odds = ratio + logit(share)
+        fraction = (total[after] - total[first] + 0.5) / (after - first + 1.0)
+        odds = ratio + logit(fraction)
     return odds
 
 

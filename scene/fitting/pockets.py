@@ -107,7 +107,7 @@ _MIN_POCKETS = 6  # with fewer there is no lining
 _MIN_SEEN = 0.6  # of the wall
 _NOISE_SHARE = 0.25  # of the depth
 _RIB = 0.02  # least wall left between two pockets, and before a mouth, m
-_OPEN_RIM, _USUAL_RIM = 0.35, 0.15  # share of the wall missing around one hole that is no pocket, and around the usual
+_OPEN_RIM, _USUAL_RIM = 0.35, 0.15  # part of the wall missing around one hole that is no pocket, and around the usual
 
 
 def find_pockets(sections: Sections) -> tuple[Shaped[np.ndarray, " p"], Float[np.ndarray, " r"]]:
@@ -117,9 +117,9 @@ def find_pockets(sections: Sections) -> tuple[Shaped[np.ndarray, " p"], Float[np
     or could be chance are no pockets: both results are empty then.
     """
     expected = uniform_filter(sections.support, _EXPECTED, mode=MODES)
-    share = sections.support / np.maximum(expected, 1e-9)
+    fraction = sections.support / np.maximum(expected, 1e-9)
     # Fraction of the wall's returns that each cell lacks against those around it: 0 none, 1 all.
-    deficit = np.where((expected > _MIN_EXPECTED) & ~_near_floor(sections), np.clip(1 - share, -1, 1), 0.0)
+    deficit = np.where((expected > _MIN_EXPECTED) & ~_near_floor(sections), np.clip(1 - fraction, -1, 1), 0.0)
     faint = _find_holes(deficit, sections)
     weak = faint.where(faint.score > _WEAK)
     reach = _ROW_WIDTH / (2 * np.pi * np.median(sections.radius) / sections.grid.columns)

@@ -225,12 +225,12 @@ def _cut_corners(first: np.ndarray, residual: np.ndarray, weight: np.ndarray, fi
     result = np.zeros_like(residual)
     for side in (1, -1):
         there = known & (side * residual > _ON_WALL)
-        share = along(there)
-        edge = (share > _MOSTLY * seen) & (seen * size >= _MIN_CELLS)
+        fraction = along(there)
+        edge = (fraction > _MOSTLY * seen) & (seen * size >= _MIN_CELLS)
         if side < 0:
             wrapped = np.concatenate([edge, edge[:, :_WIDE]], axis=1)
             edge &= steep | binary_opening(wrapped, np.ones((1, _WIDE), bool))[:, : fine.columns]
-        result[edge] = (along(np.where(there, residual, 0.0)) / np.maximum(share, 1e-9))[edge]
+        result[edge] = (along(np.where(there, residual, 0.0)) / np.maximum(fraction, 1e-9))[edge]
     return result
 
 
@@ -268,9 +268,9 @@ def bore_from_sections(axis: Axis, sections: Sections) -> Bore:
     at = axis.at(station + start)
     rows = np.clip((station + start - grid.start) / grid.step - 0.5, 0, grid.rows - 1)
     low = np.minimum(rows.astype(np.intp), max(grid.rows - 2, 0))
-    share = (rows - low)[:, None]
+    fraction = (rows - low)[:, None]
     high = np.minimum(low + 1, grid.rows - 1)
-    radius = (1 - share) * sections.radius[low] + share * sections.radius[high]
+    radius = (1 - fraction) * sections.radius[low] + fraction * sections.radius[high]
     width, height = measure_extents(grid.angle, radius)
     require_no_room(station, width)
     seen = sections.weight > 0

@@ -129,8 +129,8 @@ def _find_sleepers(
     box = np.ones(round(_SMOOTH / _BIN))
     total = np.convolve(np.bincount(index, minlength=bins), box, mode="same")
     raised = np.convolve(np.bincount(index[height[near] > step], minlength=bins), box, mode="same")
-    share = np.divide(raised, total, out=np.zeros(bins), where=total > 2)
-    first, last = find_runs(share > 0.5).T
+    fraction = np.divide(raised, total, out=np.zeros(bins), where=total > 2)
+    first, last = find_runs(fraction > 0.5).T
     wide = ((last - first) * _BIN > _WIDTHS[0]) & ((last - first) * _BIN < _WIDTHS[1])
     if wide.sum() < 3:
         return None

@@ -131,8 +131,8 @@ def resample(wall: np.ndarray, coarse: Grid, fine: Grid) -> np.ndarray:
     """Interpolates the coarse wall linearly on the fine grid; the angle wraps, the ends hold."""
     row = np.clip((fine.station - coarse.start) / coarse.step - 0.5, 0, coarse.rows - 1)
     low = np.minimum(row.astype(np.intp), max(coarse.rows - 2, 0))
-    share = (row - low)[:, None]
-    along = (1 - share) * wall[low] + share * wall[np.minimum(low + 1, coarse.rows - 1)]
+    fraction = (row - low)[:, None]
+    along = (1 - fraction) * wall[low] + fraction * wall[np.minimum(low + 1, coarse.rows - 1)]
     column = (np.arange(fine.columns) + 0.5) * coarse.columns / fine.columns - 0.5
     left = np.floor(column).astype(np.intp)
     part = column - left

@@ -64,13 +64,13 @@ class Judgement:
     coverage: Coverage | None = None  # Unseen wall
     places: tuple[Place, ...] = ()  # Unexplained returns, the largest place first
     scattered: float = 0.0  # Fraction of the returns between the ends that are unexplained and belong to no place
-    worst: tuple[tuple[float, float, float], ...] = ()  # First and last station, m, and share unexplained
+    worst: tuple[tuple[float, float, float], ...] = ()  # First and last station, m, and fraction unexplained
 
     @property
-    def shares(self) -> dict[str, float]:
+    def fractions(self) -> dict[str, float]:
         """Fractions of the returns: `explained`, `inside` and `behind` of those between the ends, `beyond` of all."""
         kinds = {"explained": EXPLAINED, "inside": INSIDE, "behind": BEHIND, "beyond_ends": BEYOND}
-        return {} if self.returns is None else {name: self.returns.share(kind) for name, kind in kinds.items()}
+        return {} if self.returns is None else {name: self.returns.fraction(kind) for name, kind in kinds.items()}
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -79,21 +79,21 @@ class Judgement:
             return result
         return {
             **result, "tolerance": self.tolerance, "returns": float(self.returns.weight.sum()),
-            "share": {**self.shares, "scattered": self.scattered}, "wall_seen": self.coverage.share,
+            "share": {**self.fractions, "scattered": self.scattered}, "wall_seen": self.coverage.fraction,
             "unseen": [vars(piece) for piece in self.coverage.pieces[:_LISTED]],
             "places": [vars(place) for place in self.places[:_LISTED]],
-            "worst_stations": [{"start": a, "end": b, "unexplained": share} for a, b, share in self.worst],
+            "worst_stations": [{"start": a, "end": b, "unexplained": fraction} for a, b, fraction in self.worst],
         }  # fmt: skip
 
     def summary(self) -> str:
         """Return the fractions in one line for people."""
         if self.returns is None:
             return "judged: a ring survey holds no returns to judge by"
-        share = self.shares
+        part = self.fractions
         text = (
-            f"judged: {share['explained']:.1%} of {self.returns.weight.sum():,.0f} returns within "
-            f"{100 * self.tolerance:.0f} cm of the model, {share['inside']:.1%} inside, {share['behind']:.1%} behind "
-            f"the wall, {share['beyond_ends']:.1%} beyond the ends"
+            f"judged: {part['explained']:.1%} of {self.returns.weight.sum():,.0f} returns within "
+            f"{100 * self.tolerance:.0f} cm of the model, {part['inside']:.1%} inside, {part['behind']:.1%} behind "
+            f"the wall, {part['beyond_ends']:.1%} beyond the ends"
         )
         return f"{text}; worst {name_span(*self.worst[0][:2])} ({self.worst[0][2]:.0%})" if self.worst else text
 
@@ -164,10 +164,10 @@ _CUT_SHORT = 2.0  # m of lining beyond an end that are worth a word
 
 def _warn_of_ends(bore: Bore, returns: Returns) -> list[Warned]:
     result = []
-    if returns.share(BEYOND) > _WARN_BEYOND:
+    if returns.fraction(BEYOND) > _WARN_BEYOND:
         result.append(Warned(
             Code.BEYOND,
-            f"{returns.share(BEYOND):.0%} of all returns lie beyond the ends of what was built, at 0 and "
+            f"{returns.fraction(BEYOND):.0%} of all returns lie beyond the ends of what was built, at 0 and "
             f"{bore.length:.0f} m: terrain, a hall, or a piece of tunnel behind a gap, which is a cloud of its own",
         ))  # fmt: skip
     for beyond, where, station in zip(measure_overruns(bore, returns), ("before", "beyond"), (0.0, bore.length),
@@ -187,10 +187,10 @@ def _warn_of_unseen(coverage: Coverage) -> list[Warned]:
         Warned(
             Code.UNSEEN,
             f"{name_span(piece.start, piece.end)} hardly a return lies {_on(piece.sides)} "
-            f"({piece.share:.0%} of the girth, {piece.area:.0f} m²): the wall there is a guess",
+            f"({piece.fraction:.0%} of the girth, {piece.area:.0f} m²): the wall there is a guess",
             piece.start, piece.end,
         )
-        for piece in coverage.pieces[:_LISTED] if piece.share > _WARN_UNSEEN
+        for piece in coverage.pieces[:_LISTED] if piece.fraction > _WARN_UNSEEN
     ]  # fmt: skip
 
 
@@ -202,12 +202,12 @@ def _warn_of_places(places: tuple[Place, ...], tolerance: float) -> list[Warned]
     return [
         Warned(
             Code.PLACE,
-            f"{name_span(place.start, place.end)}, {place.sides}: {place.share:.0%} of the returns there are not the "
-            f"wall that was built, up to {place.furthest:.1f} m {'behind' if place.behind else 'inside'} it, "
+            f"{name_span(place.start, place.end)}, {place.sides}: {place.fraction:.0%} of the returns there are not "
+            f"the wall that was built, up to {place.furthest:.1f} m {'behind' if place.behind else 'inside'} it, "
             f"{place.low:.1f} to {place.high:.1f} m above the floor",
             place.start, place.end,
         )
-        for place in places[:_LISTED] if place.share > _WARN_LOCAL and place.furthest > tolerance
+        for place in places[:_LISTED] if place.fraction > _WARN_LOCAL and place.furthest > tolerance
     ]  # fmt: skip
 
 
@@ -219,14 +219,14 @@ def _worst_windows(bore: Bore, returns: Returns) -> tuple[tuple[float, float, fl
         np.histogram(returns.station[rows], edges, weights=returns.weight[rows])[0]
         for rows in (returns.in_span, (returns.kind == INSIDE) | (returns.kind == BEHIND))
     )
-    share = wrong / np.maximum(total, 1e-9)
+    fraction = wrong / np.maximum(total, 1e-9)
     result: list[int] = []
-    for k in np.argsort(-share, kind="stable"):
-        if share[k] <= 0.0 or len(result) == _LISTED:
+    for k in np.argsort(-fraction, kind="stable"):
+        if fraction[k] <= 0.0 or len(result) == _LISTED:
             break
         if all(abs(int(k) - other) > 1 for other in result):
             result.append(int(k))
-    return tuple((float(edges[k]), float(edges[k + 1]), float(share[k])) for k in result)
+    return tuple((float(edges[k]), float(edges[k + 1]), float(fraction[k])) for k in result)
 
 
 def require_trust(judgement: Judgement, force: bool) -> None:

@@ -203,8 +203,8 @@ def _sections(bore: Bore, judgement: Judgement) -> list[str]:
         return []
     figures = [
         f"<figure>{draw_section(bore, returns, start, end)}"
-        f"<figcaption>{escape(name_span(start, end))}: {share:.1%} unexplained</figcaption></figure>"
-        for start, end, share in worst
+        f"<figcaption>{escape(name_span(start, end))}: {fraction:.1%} unexplained</figcaption></figure>"
+        for start, end, fraction in worst
     ]
     return [
         "<h2>Worst stations</h2><p>Returns over the section that was built, looking ahead.</p>",
@@ -220,11 +220,11 @@ def _tables(judgement: Judgement, content: dict[str, Any]) -> list[str]:
     places = [
         (name_span(place.start, place.end), "behind the wall" if place.behind else "inside", place.sides,
          f"{place.low:.1f} to {place.high:.1f} m above the floor",
-         f"{place.returns:,.0f} returns, {place.share:.1%} of those there")
+         f"{place.returns:,.0f} returns, {place.fraction:.1%} of those there")
         for place in judgement.places
     ]  # fmt: skip
     unseen = [
-        (name_span(piece.start, piece.end), piece.sides, f"{piece.area:.0f} m², {piece.share:.0%} of the girth")
+        (name_span(piece.start, piece.end), piece.sides, f"{piece.area:.0f} m², {piece.fraction:.0%} of the girth")
         for piece in (judgement.coverage.pieces if judgement.coverage is not None else ())
     ]
     provenance = sorted(content.get("provenance", {}).items())

@@ -56,7 +56,7 @@ class Returns:
         """True for returns between the ends of the bore."""
         return self.kind != BEYOND
 
-    def share(self, kind: int) -> float:
+    def fraction(self, kind: int) -> float:
         """Return the fraction of one kind in all returns, `BEYOND`, or in those between the ends, the others."""
         rows = np.ones(len(self.kind), bool) if kind == BEYOND else self.in_span
         total = float(self.weight[rows].sum())
@@ -101,13 +101,13 @@ def wall_radius(bore: Bore, station: np.ndarray, angle: np.ndarray) -> Float[np.
     columns = len(bore.angle)
     row = np.clip(station / bore.station[1], 0, len(bore.station) - 1)
     low = np.minimum(row.astype(np.intp), len(bore.station) - 2)
-    share = row - low
+    fraction = row - low
     column = (angle - bore.angle[0]) / (2 * np.pi) * columns % columns
     left = np.floor(column).astype(np.intp) % columns
     right, part = (left + 1) % columns, column - np.floor(column)
     before = (1 - part) * bore.radius[low, left] + part * bore.radius[low, right]
     after = (1 - part) * bore.radius[low + 1, left] + part * bore.radius[low + 1, right]
-    return (1 - share) * before + share * after
+    return (1 - fraction) * before + fraction * after
 
 
 def _distance_to_section(
@@ -162,8 +162,8 @@ def name_sides(angle: Float[np.ndarray, " k"], weight: Float[np.ndarray, " k"]) 
     Returns `floor`, `left wall`, `right wall`, `crown`, two of them, or `all around`.
     """
     quarter = np.floor((angle + 3 * np.pi / 4) / (np.pi / 2)).astype(np.intp) % 4
-    share = np.bincount(quarter, weight, 4) / max(float(weight.sum()), 1e-12)
-    named = [_SIDES[k] for k in np.argsort(-share, kind="stable") if share[k] >= _PART]
+    fraction = np.bincount(quarter, weight, 4) / max(float(weight.sum()), 1e-12)
+    named = [_SIDES[k] for k in np.argsort(-fraction, kind="stable") if fraction[k] >= _PART]
     if len(named) == 4:
         return "all around"
     return " and ".join(sorted(named)) if len(named) < 3 else ", ".join(sorted(named))
@@ -191,7 +191,7 @@ class Place:
     behind: bool  # Behind the wall; else inside the bore
     sides: str  # Where they lie about the axis, in words
     returns: float  # Number of returns
-    share: float  # Of the returns at its stations
+    fraction: float  # Of the returns at its stations
     furthest: float  # Distance from the wall of all but the last twentieth, m
     low: float  # Height of its lowest part above the floor on the axis, m
     high: float  # Of its highest part, m
@@ -246,9 +246,9 @@ def _describe(
     floor = -bore.toward(-np.pi / 2)[bore.row_of(returns.station[own])]
     low, high = (float(v) for v in np.percentile(returns.upward[own] - floor, [2, 98]))
     furthest = float(np.percentile(np.abs(returns.outward[own]), 95))
-    share = float(weight.sum()) / max(around, 1e-9)
+    fraction = float(weight.sum()) / max(around, 1e-9)
     sides = name_sides(returns.angle[own], weight)
-    return Place(start, end, behind, sides, float(weight.sum()), share, furthest, low, high)
+    return Place(start, end, behind, sides, float(weight.sum()), fraction, furthest, low, high)
 
 
 ROW = 1.0  # m
@@ -267,7 +267,7 @@ class Unseen:
     end: float  # Last station, m
     area: float  # m²
     sides: str  # Where it lies about the axis, in words
-    share: float  # Of the girth, in the mean over its stations
+    fraction: float  # Of the girth, in the mean over its stations
 
 
 @dataclass(frozen=True)
@@ -280,7 +280,7 @@ class Coverage:
     pieces: tuple[Unseen, ...]  # Unseen pieces of some size, the largest first
 
     @property
-    def share(self) -> float:
+    def fraction(self) -> float:
         """Fraction of the cells that were seen."""
         return float(self.seen.mean())
 

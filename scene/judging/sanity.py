@@ -50,8 +50,8 @@ def doubt_layers(bore: Bore, cloud: Cloud) -> list[Warned]:
     doubled = known & (apart > 0)
     count = max(round(bore.length / _WINDOW), 1)
     window = np.minimum((at / bore.length * count).astype(np.intp), count - 1)
-    share = np.bincount(window[doubled], minlength=count) / np.maximum(np.bincount(window[known], minlength=count), 1)
-    rows = np.flatnonzero(share > _DOUBLED)
+    twice = np.bincount(window[doubled], minlength=count) / np.maximum(np.bincount(window[known], minlength=count), 1)
+    rows = np.flatnonzero(twice > _DOUBLED)
     if not len(rows):
         return []
     widest = 100 * float(np.percentile(apart[doubled], 90))

@@ -92,8 +92,8 @@ class Tracker:
 
     def _expected(self, middle: float, gap: float, guide: Guide | None) -> np.ndarray:
         """Return the step from the last sweep's pose to this one's, by the guide or as the last step was."""
-        share = gap / self._pace
-        step = _pose_matrix(Rotation.from_matrix(self._step[:3, :3]) ** share, share * self._step[:3, 3])
+        fraction = gap / self._pace
+        step = _pose_matrix(Rotation.from_matrix(self._step[:3, :3]) ** fraction, fraction * self._step[:3, 3])
         if guide is not None and self.poses:
             places, turns = guide.trajectory.at(np.array([self._time, middle]))
             step[:3, :3] = (turns[0].inv() * turns[1]).as_matrix()
@@ -104,10 +104,10 @@ class Tracker:
     def _unwound(self, scan: Scan, middle: float, guide: Guide | None, step: np.ndarray, gap: float) -> np.ndarray:
         """Return the sweep's points as seen from where the sensor was in the middle of it, m."""
         times = np.linspace(scan.stamp, max(2 * middle - scan.stamp, scan.stamp + _LEAST_SPAN), _KNOTS)
-        share = (times - middle) / gap
-        shifts = share[:, None] * step[:3, 3]
+        fraction = (times - middle) / gap
+        shifts = fraction[:, None] * step[:3, 3]
         if guide is None:
-            turns = Rotation.from_rotvec(share[:, None] * Rotation.from_matrix(step[:3, :3]).as_rotvec())
+            turns = Rotation.from_rotvec(fraction[:, None] * Rotation.from_matrix(step[:3, :3]).as_rotvec())
         else:
             places, turns = guide.trajectory.at(times)
             back = turns[_KNOTS // 2].inv()

@@ -96,7 +96,7 @@ def _first_knots(problem: Problem, chain: Chain, n: int) -> tuple[Problem, Chain
     motion, short = _part_of(problem.motion, chain, slice(0, n))
     seen = problem.sightings
     near = seen.knot < n - 1
-    seen = replace(seen, knot=seen.knot[near], share=seen.share[near], position=seen.position[near])
+    seen = replace(seen, knot=seen.knot[near], fraction=seen.fraction[near], position=seen.position[near])
     return replace(problem, motion=motion, sightings=seen), short
 
 
@@ -272,5 +272,5 @@ def make_sightings(
         raise FitError(f"{control.path}: no row of the control lies within the recording", Refusal.POSES)
     when = control.times[inside]
     knot = np.clip(np.searchsorted(times, when, "right") - 1, 0, len(times) - 2)
-    share = (when - times[knot]) / (times[knot + 1] - times[knot])
-    return Sightings(knot, share, control.positions[inside], lever, sigma)
+    fraction = (when - times[knot]) / (times[knot + 1] - times[knot])
+    return Sightings(knot, fraction, control.positions[inside], lever, sigma)

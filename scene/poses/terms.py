@@ -200,7 +200,7 @@ class Sightings:
     """Positions of a point fixed to the body."""
 
     knot: Int[np.ndarray, " m"]  # Knot before each
-    share: Float[np.ndarray, " m"]  # Way from that knot to the next, 0 to 1
+    fraction: Float[np.ndarray, " m"]  # Way from that knot to the next, 0 to 1
     position: Float[np.ndarray, "m 3"]  # m
     lever: Float[np.ndarray, "3"]  # Position of the point in the body, m
     sigma: float  # Standard deviation in each axis, m
@@ -211,21 +211,21 @@ class Sightings:
         return position + attitude @ self.lever - self.position
 
     def _between(self, chain: Chain) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        share, after = self.share[:, None], self.knot + 1
-        position = (1 - share) * chain.position[self.knot] + share * chain.position[after]
+        fraction, after = self.fraction[:, None], self.knot + 1
+        position = (1 - fraction) * chain.position[self.knot] + fraction * chain.position[after]
         turn = rotation_vectors(chain.attitude[self.knot].mT @ chain.attitude[after])
-        return position, chain.attitude[self.knot] @ rotation_matrices(share * turn), share[:, :, None]
+        return position, chain.attitude[self.knot] @ rotation_matrices(fraction * turn), fraction[:, :, None]
 
     def add_to(self, equations: NormalEquations, chain: Chain, robust: float) -> None:
         """Adds these terms; beyond `robust` standard deviations (Cauchy) a sighting counts ever less."""
-        position, attitude, share = self._between(chain)
+        position, attitude, fraction = self._between(chain)
         residual = (position + attitude @ self.lever - self.position) / self.sigma
         weight = 1 / np.sqrt(1 + (np.linalg.norm(residual, axis=1) / robust) ** 2)
         arm = -attitude @ cross_matrices(self.lever[None])[0]
         whole = np.zeros((len(residual), 3, KNOT_SIZE))
         whole[:, :, _TURN], whole[:, :, _SHIFT] = arm, _EYE
         whole *= (weight / self.sigma)[:, None, None]
-        equations.add(weight[:, None] * residual, self.knot, (1 - share) * whole, self.knot + 1, share * whole)
+        equations.add(weight[:, None] * residual, self.knot, (1 - fraction) * whole, self.knot + 1, fraction * whole)
 
 
 @dataclass(frozen=True)

@@ -56,14 +56,14 @@ def deskew(scan: Scan, trajectory: Trajectory) -> Float[np.ndarray, "n 3"]:
     positions, rotations = trajectory.at(scan.stamp + knots)
     at = scan.times / knots[-1] * (_KNOTS - 1)
     low = np.minimum(at.astype(np.intp), _KNOTS - 2)
-    share = (at - low)[:, None]
+    fraction = (at - low)[:, None]
     matrices = rotations.as_matrix()
     points = scan.points.astype(np.float64)
 
     def from_pose(knot: np.ndarray) -> np.ndarray:
         return np.einsum("nij,nj->ni", matrices[knot], points) + positions[knot]
 
-    return (1 - share) * from_pose(low) + share * from_pose(low + 1)
+    return (1 - fraction) * from_pose(low) + fraction * from_pose(low + 1)
 
 
 def save_tum(trajectory: Trajectory, path: Path) -> None:

@@ -224,7 +224,7 @@ def column_height(points: Float[np.ndarray, "n 3"]) -> float | None:
     full = counts >= _IN_COLUMN // 3
     if not full.any():
         return None
-    low, high = (order[starts[full] + (share * (counts[full] - 1)).astype(np.intp)] for share in (0.05, 0.95))
+    low, high = (order[starts[full] + (fraction * (counts[full] - 1)).astype(np.intp)] for fraction in (0.05, 0.95))
     return float(np.median(points[high, 2] - points[low, 2]))
 
 

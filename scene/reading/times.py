@@ -31,7 +31,7 @@ _WIDE = 1.5  # times the reach of a sweep from its middle: further is no time of
 SHORT, WHOLE = 0.075, 0.1  # s: messages closer than that are parts of a sweep, or quick ones; what they are joined to
 MOST_BAD = 0.05  # fraction of all points without a time of their sweep
 _SAMPLE = 4000  # points of a sweep by which its span is found
-_MOST, _AROUND = 0.85, 3.0  # share of the points that lie about the median; how much further a time of theirs may lie
+_MOST, _AROUND = 0.85, 3.0  # part of the points that lie about the median; how much further a time of theirs may lie
 _LONG = 0.95  # quantile of the spans of all sweeps that is the length of one: of some the first or last beams are lost
 _COUNTER = 2.0**32  # values of a counter of 32 bits
 _LIKE = 0.1  # of the spread that a fraction of a sweep has: times with less of it are alike
@@ -302,8 +302,8 @@ class Spans:
             )
         best = fits[0]
         longer = list(_UNITS)[list(_UNITS).index(best) - 1] if best != "s" else None
-        share = span * _UNITS[best] / period if np.isfinite(period) else 1.0
-        if longer and share < _LEAST_SWEEP and span * _UNITS[longer] < _UNSURE * period:
+        fraction = span * _UNITS[best] / period if np.isfinite(period) else 1.0
+        if longer and fraction < _LEAST_SWEEP and span * _UNITS[longer] < _UNSURE * period:
             raise ValueError(
                 f"has times in `{self.name}` that fit two readings: {_shown(longer)}, sweeps of "
                 f"{span * _UNITS[longer]:.3g} s, or {_shown(best)}, sweeps of {span * _UNITS[best]:.3g} s, "

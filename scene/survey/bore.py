@@ -92,8 +92,8 @@ class Bore:
 
 def _flare(length: float, run: float, width: float) -> Trend:
     """Return a last mouth that is wider, opening with the square of the distance over a run, m."""
-    share = np.linspace(0.0, 1.0, int(run) + 1)
-    return Trend(tuple(length - run + run * share), tuple(width * share**2))
+    fraction = np.linspace(0.0, 1.0, int(run) + 1)
+    return Trend(tuple(length - run + run * fraction), tuple(width * fraction**2))
 
 
 @dataclass(frozen=True)

@@ -208,9 +208,9 @@ class Carried:
         exact = self.poses(knots)
         place = (time - begin) / _TABLE
         low = np.minimum(place.astype(np.int64), len(knots) - 2)
-        share = (place - low)[:, None]
-        position = exact.position[low] + share * (exact.position[low + 1] - exact.position[low])
-        quaternion = exact.quaternion[low] + share * (exact.quaternion[low + 1] - exact.quaternion[low])
+        fraction = (place - low)[:, None]
+        position = exact.position[low] + fraction * (exact.position[low + 1] - exact.position[low])
+        quaternion = exact.quaternion[low] + fraction * (exact.quaternion[low + 1] - exact.quaternion[low])
         return Poses(position, quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True))
 
 

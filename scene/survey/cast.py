@@ -152,7 +152,7 @@ def noise_sigma(
 def mix_pixels(
     rng: np.random.Generator,
     lidar: Lidar,
-    share: float,
+    fraction: float,
     loaded: Loaded,
     origin: Float[np.ndarray, "n 3"],
     heading: Float[np.ndarray, "n 3"],
@@ -164,7 +164,7 @@ def mix_pixels(
     plane that its middle meets, and less than `PULSE` further or nearer. Of those, `share` report a distance drawn
     evenly between the two. Rays are in the survey frame, m; `hits` is the first surface on the middle of each.
     """
-    chosen = np.flatnonzero((rng.random(len(heading), np.float32) < share) & np.isfinite(hits.distance))
+    chosen = np.flatnonzero((rng.random(len(heading), np.float32) < fraction) & np.isfinite(hits.distance))
     ray, near, normal = heading[chosen], hits.distance[chosen], hits.normal[chosen]
     side = np.cross(ray, rng.standard_normal(ray.shape))
     side /= np.linalg.norm(side, axis=1, keepdims=True)

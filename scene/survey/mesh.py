@@ -234,8 +234,8 @@ def pocket_mesh(mouth: Float[np.ndarray, "a b 3"], out: Float[np.ndarray, "3"], 
 
 def _floor_mesh(left: Float[np.ndarray, "n 3"], right: Float[np.ndarray, "n 3"], rows: Float[np.ndarray, "n"]) -> Mesh:
     n_across = int(np.ceil(np.linalg.norm(left - right, axis=1).max() / _FLOOR_CELL)) + 1
-    share = np.linspace(0.0, 1.0, n_across)[:, None]
-    vertices = right[:, None] + share * (left - right)[:, None]
+    fraction = np.linspace(0.0, 1.0, n_across)[:, None]
+    vertices = right[:, None] + fraction * (left - right)[:, None]
     faces = split_quads(grid_quads(np.arange(len(rows) * n_across).reshape(len(rows), n_across)))
     station = (0.5 * (rows[1:] + rows[:-1])).repeat(2 * (n_across - 1))
     return Mesh(vertices.reshape(-1, 3), faces, np.full(len(faces), Part.FLOOR, np.uint8), station)

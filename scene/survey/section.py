@@ -116,7 +116,7 @@ def _sample_half(kind: type[S], half: Float[np.ndarray, "n 2"], breaks: tuple[fl
     half = half[np.concatenate([[True], np.linalg.norm(np.diff(half, axis=0), axis=1) > 1e-9])]
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(half, axis=0), axis=1))])
     height = half[-1, 1]
-    middles = np.interp([*_WALL_ROWS, *(share * height for share in _CROWN_ROWS)], half[:, 1], along)
+    middles = np.interp([*_WALL_ROWS, *(fraction * height for fraction in _CROWN_ROWS)], half[:, 1], along)
     edges = np.add.outer(middles, _HALF_POCKET)
     girth = refine_breaks(np.concatenate([[0.0, along[-1]], edges.ravel(), np.interp(breaks, half[:, 1], along)]), CELL)
     left = np.stack([np.interp(girth, along, v) for v in half.T], axis=-1)

@@ -280,8 +280,8 @@ def planar_segments(
         if not len(crossed):
             continue
         a, b = crossed.T
-        share = over[a] / (over[a] - over[b])
-        outline = corner[a, :2] + share[:, None] * (corner[b, :2] - corner[a, :2])
+        fraction = over[a] / (over[a] - over[b])
+        outline = corner[a, :2] + fraction[:, None] * (corner[b, :2] - corner[a, :2])
         offset = outline - outline.mean(axis=0)
         outline = outline[np.argsort(np.arctan2(offset[:, 1], offset[:, 0]))]
         outlines.append(np.hstack([outline, np.roll(outline, -1, axis=0)]))

@@ -213,8 +213,8 @@ def wall_offset(bore: Bore, level: Float[np.ndarray, " n"], side: int) -> Float[
     level = level[:, None]
     next_across, next_upward = np.roll(across, -1, axis=1), np.roll(upward, -1, axis=1)
     crosses = (upward < level) != (next_upward < level)
-    share = np.where(crosses, (level - upward) / np.where(crosses, next_upward - upward, 1.0), 0.0)
-    return np.where(crosses, across + share * (next_across - across), 0.0).max(axis=1)
+    fraction = np.where(crosses, (level - upward) / np.where(crosses, next_upward - upward, 1.0), 0.0)
+    return np.where(crosses, across + fraction * (next_across - across), 0.0).max(axis=1)
 
 
 def describe_track(track: Track, seen: SeenTrack) -> dict[str, Any]:

@@ -66,13 +66,13 @@ def _start_sleeper(along: Float[Array, ""], params: WalkParams) -> Int[Array, ""
     station = params.track.station
     count, last = station.shape[0], station.shape[0] - 1
     margin = jnp.minimum(_MARGIN / (station[last] - station[0]), 0.25)
-    share = margin + 0.5 * (along + 1.0) * (1.0 - 2.0 * margin)
-    return jnp.clip((share * count).astype(jnp.int32), 0, last)
+    fraction = margin + 0.5 * (along + 1.0) * (1.0 - 2.0 * margin)
+    return jnp.clip((fraction * count).astype(jnp.int32), 0, last)
 
 
-def _between(limits: Any, share: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Number between two limits, for a share in [-1, 1)."""
-    return limits[0] + 0.5 * (share + 1.0) * (limits[1] - limits[0])
+def _between(limits: Any, fraction: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Number between two limits, for a fraction in [-1, 1)."""
+    return limits[0] + 0.5 * (fraction + 1.0) * (limits[1] - limits[0])
 
 
 def _draw_build(noise: Float[Array, "29"], params: RandomisationParams) -> Build:

@@ -94,8 +94,8 @@ def _foot_offsets(state: GaitState, drift: Float[Array, "2"], period: float, par
     """
     airborne = (_leg_phase(state) >= params.duty)[:, None]
     aim = state.stride * params.place * jnp.clip(drift, -1.0, 1.0)
-    share = jnp.where(airborne, period / 0.05, (1.0 - state.stride) * period / 0.2)
-    return state.offset + jnp.minimum(share, 1.0) * (aim - state.offset)
+    fraction = jnp.where(airborne, period / 0.05, (1.0 - state.stride) * period / 0.2)
+    return state.offset + jnp.minimum(fraction, 1.0) * (aim - state.offset)
 
 
 def stance(state: GaitState, params: GaitParams) -> Float[Array, "4"]:
@@ -118,8 +118,8 @@ def targets(state: GaitState, gravity: Float[Array, "3"], params: GaitParams) ->
         Joint targets, rad: the angles of the gait, plus the deflection of a servo of finite stiffness under the load.
     """
     angles = kinematics.joint_angles(foot_targets(state, gravity, params))
-    share = stance(state, params)
-    load = _WEIGHT * share / jnp.maximum(jnp.sum(share), 1.0)
+    fraction = stance(state, params)
+    load = _WEIGHT * fraction / jnp.maximum(jnp.sum(fraction), 1.0)
     return (angles + kinematics.load_torques(angles, load) / kinematics.STIFFNESS).reshape(-1)
 
 

@@ -93,8 +93,8 @@ def leg_velocity(
     spin_x = rates[1] * feet[:, 2] - rates[2] * feet[:, 1]
     spin_y = rates[2] * feet[:, 0] - rates[0] * feet[:, 2]
     spin_z = rates[0] * feet[:, 1] - rates[1] * feet[:, 0]
-    share = standing / jnp.maximum(jnp.sum(standing), 1e-3)
-    x, y, z = (-jnp.sum(share * (motion[:, i] + spin)) for i, spin in enumerate((spin_x, spin_y, spin_z)))
+    fraction = standing / jnp.maximum(jnp.sum(standing), 1e-3)
+    x, y, z = (-jnp.sum(fraction * (motion[:, i] + spin)) for i, spin in enumerate((spin_x, spin_y, spin_z)))
     return level_velocity(jnp.stack([x, y, z]), gravity)
 
 

@@ -80,11 +80,11 @@ def _round_ends(rows: Float[np.ndarray, "n 5"], rounding: float) -> Float[np.nda
     places = np.concatenate(
         [low + rounding * (1.0 - np.cos(turn)), inner, high - rounding * (1.0 - np.cos(turn[::-1]))]
     )
-    share = np.concatenate([np.sin(turn), np.ones(len(inner)), np.sin(turn[::-1])])
+    fraction = np.concatenate([np.sin(turn), np.ones(len(inner)), np.sin(turn[::-1])])
     apart = np.append(True, np.diff(places) > 1e-9)  # both ends of a ball meet in its middle
-    places, share = places[apart], share[apart]
+    places, fraction = places[apart], fraction[apart]
     made = np.column_stack([places, *(np.interp(places, rows[:, 0], column) for column in rows.T[1:])])
-    made[:, 3:] *= np.maximum(share, 0.05)[:, None]
+    made[:, 3:] *= np.maximum(fraction, 0.05)[:, None]
     return made
 
 

@@ -47,8 +47,8 @@ class LaggedWheels(Unicycle):
     def obey(self, action: Float[Array, "n_action"], state: State, params: EnvParams) -> Float[Array, "2"]:
         """Follow the clipped command, late."""
         target = clip_action(action[:2], params.vehicle) * jnp.array(self.gain)
-        share = 1.0 - jnp.exp(-jnp.asarray(params.vehicle.period) / jnp.array(self.lag))
-        return clip_action(state.command + share * (target - state.command), params.vehicle)
+        fraction = 1.0 - jnp.exp(-jnp.asarray(params.vehicle.period) / jnp.array(self.lag))
+        return clip_action(state.command + fraction * (target - state.command), params.vehicle)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -21,7 +21,7 @@ from subterra_jax.baselines.steering import CentreLine, steering_of
 from subterra_jax.state import EnvParams
 
 NAME = "ceiling"
-# Of a dense cloud: the least share that a scan may leave, and below which it is resampled.
+# Of a dense cloud: the least fraction that a scan may leave, and below which it is resampled.
 _DENSE_LEAST, _DENSE_DUE = 0.02, 0.3
 
 

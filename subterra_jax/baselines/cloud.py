@@ -82,14 +82,14 @@ def commanded_cloud(params: EnvParams) -> CloudParams:
 
 def cloud_params(params: EnvParams) -> CloudParams:
     """Return the motion of a cloud for the nominal errors of a task; on the host."""
-    share = odometer_share(params)
+    fraction = odometer_share(params)
     (lasting, changing), (plant_lasting, plant_changing) = odometer_errors(params), command_errors(params)
-    fused = lambda a, b: float(np.hypot(share * a, (1.0 - share) * b))  # noqa: E731
+    fused = lambda a, b: float(np.hypot(fraction * a, (1.0 - fraction) * b))  # noqa: E731
     wander = params.slip.wander if "slip" in params.parts else params.odometry.wander
     return CloudParams(
         scale_sigma=fused(lasting, plant_lasting),
         wander=WanderParams(fused(changing, plant_changing), 30.0 if wander is None else float(wander.length)),
-        step_sigma=max(0.005, share * float(params.odometry.distance_sigma)),
+        step_sigma=max(0.005, fraction * float(params.odometry.distance_sigma)),
         slip_rate=_SLIP_RATE if "faults" in params.parts else 0.0,
         slip_loss=float(fault_sizes(params).wet_loss),
     )
@@ -233,8 +233,8 @@ def summarise(cloud: Cloud, params: CloudParams) -> tuple[Float[Array, ""], Floa
     mass = jnp.sum(jnp.where(near, weight, 0.0), axis=1)
     best = jnp.argmax(mass)
     inside = jnp.where(near[best], weight, 0.0)
-    share = jnp.maximum(mass[best], 1e-12)
-    mean = lambda value: jnp.sum(inside * value) / share  # noqa: E731
+    fraction = jnp.maximum(mass[best], 1e-12)
+    mean = lambda value: jnp.sum(inside * value) / fraction  # noqa: E731
     middle = mean(station)
     sigma = jnp.sqrt(jnp.sum(weight * (station - middle) ** 2))
     return middle, sigma, jnp.arctan2(mean(sin), mean(cos))

@@ -2,7 +2,7 @@
 
 Cells lie on a tape of starts. A robot that began at position u of the tape and has driven a way of W is at u + W, or at
 u - W where it faces falling stations, so that driving moves no mass. A second axis holds the relative error of dead
-reckoning, which lasts: mass of a row slides by that share of each step. So sixty metres of faint relief count together,
+reckoning, which lasts: mass of a row slides by that fraction of a step. So sixty metres of faint relief count together,
 where a filter that forgets its scale must find it anew.
 
 Source: Burgard et al. 1996, Estimating the absolute position of a mobile robot using position probability grids.
@@ -57,8 +57,8 @@ def summarise(
     way, at = best // mass.shape[1], best % mass.shape[1]
     inside = jnp.abs(station - station[way, at]) <= reach + 0.5 * cell
     cluster = mass * inside * (jnp.arange(mass.shape[0])[:, None] == way)
-    share = jnp.maximum(jnp.sum(cluster), 1e-12)
-    middle = jnp.sum(cluster * station) / share
+    fraction = jnp.maximum(jnp.sum(cluster), 1e-12)
+    middle = jnp.sum(cluster * station) / fraction
     sigma = jnp.sqrt(jnp.sum(mass * (station - middle) ** 2))
     return middle, sigma, 1.0 - 2.0 * way
 
@@ -191,8 +191,8 @@ class HistogramLocaliser(Localiser):
         before, after = jnp.maximum(shift, 0.0), jnp.maximum(-shift, 0.0)
         low, high = _neighbours(mass)
         mass = (1.0 - before - after) * mass + before * low + after * high
-        share = jnp.where(size > 0.0, jnp.minimum((noise.step_sigma / self.cell) ** 2, 0.5), 0.0)
-        return jnp.maximum(_diffused(mass, share), np.float32(np.exp(_FLOOR)))
+        fraction = jnp.where(size > 0.0, jnp.minimum((noise.step_sigma / self.cell) ** 2, 0.5), 0.0)
+        return jnp.maximum(_diffused(mass, fraction), np.float32(np.exp(_FLOOR)))
 
     def _score(self, walls: WallMap, pose: TunnelPose, obs: Observed, params: EnvParams) -> Float[Array, "ways n"]:
         """Computes the log likelihood of a scan in every cell."""

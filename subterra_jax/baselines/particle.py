@@ -82,8 +82,8 @@ class ParticleLocaliser(Localiser):
         """Spreads particles about the start as far as it is uncertain; without one evenly, facing either way."""
         n, cloud_key = self.n_particles, jax.random.key(self.seed)
         if params.goal_kind == "report":
-            room, share = params.tunnel.length - 2.0 * params.goal.margin, (jnp.arange(n) + 0.5) / n
-            station, heading = params.goal.margin + room * share, jnp.where(jnp.arange(n) % 2 == 0, 0.0, jnp.pi)
+            room, fraction = params.tunnel.length - 2.0 * params.goal.margin, (jnp.arange(n) + 0.5) / n
+            station, heading = params.goal.margin + room * fraction, jnp.where(jnp.arange(n) % 2 == 0, 0.0, jnp.pi)
         else:
             station_key, cloud_key = jax.random.split(cloud_key)
             spread = jnp.clip(jax.random.normal(station_key, (n,)), -3.0, 3.0)

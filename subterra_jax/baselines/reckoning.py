@@ -61,8 +61,8 @@ def reckon(
     waiting = jnp.where(waits, before.waiting, 0.0)
     delay = jnp.minimum(before.delay + late.astype(jnp.int32), MAX_DELAY)
     speeds = jnp.concatenate([speed[None], before.speeds[:-1]])
-    share = jnp.where(still, 0.0, odometer_share)
-    distance = jnp.where(waiting > 0.0, 0.0, share * moved + (1.0 - share) * speeds[delay] * period)
+    fraction = jnp.where(still, 0.0, odometer_share)
+    distance = jnp.where(waiting > 0.0, 0.0, fraction * moved + (1.0 - fraction) * speeds[delay] * period)
     turn = jnp.where(waiting > 0.0, 0.0, jnp.where(still, jnp.nan, turned))
     return distance, turn, Reckoning(obs.distance, obs.heading, speeds, delay, waiting)
 
@@ -71,8 +71,8 @@ def known_delay(before: Reckoning, params: EnvParams, known: Known) -> Reckoning
     """Return the dead reckoning with the delay that the episode has, where the truth is given and faults are drawn."""
     if known is None or "fault_delay" not in known:
         return before
-    share = known["severity"] / (N_SEVERITIES - 1)
-    delay = jnp.clip(jnp.round(params.faults.delay * known["fault_delay"] * share), 0, MAX_DELAY).astype(jnp.int32)
+    fraction = known["severity"] / (N_SEVERITIES - 1)
+    delay = jnp.clip(jnp.round(params.faults.delay * known["fault_delay"] * fraction), 0, MAX_DELAY).astype(jnp.int32)
     return dataclasses.replace(before, delay=delay, waiting=jnp.zeros_like(before.waiting))
 
 

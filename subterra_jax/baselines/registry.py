@@ -43,11 +43,11 @@ class Random(Agent):
     def act(
         self, key: PRNGKeyArray, memory: Float[Array, ""], obs: Observed, params: EnvParams, known: Known
     ) -> tuple[Action, Float[Array, ""]]:
-        share = jax.random.uniform(key, (3,))
-        speed = params.vehicle.speed_max * share[0]
-        yaw_rate = params.vehicle.yaw_rate_max * (2.0 * share[1] - 1.0)
+        fraction = jax.random.uniform(key, (3,))
+        speed = params.vehicle.speed_max * fraction[0]
+        yaw_rate = params.vehicle.yaw_rate_max * (2.0 * fraction[1] - 1.0)
         no_estimate = jnp.full((), jnp.nan)
-        return jnp.stack([speed, yaw_rate, no_estimate, jnp.zeros(()), 2.0 * share[2] - 1.0]), memory
+        return jnp.stack([speed, yaw_rate, no_estimate, jnp.zeros(()), 2.0 * fraction[2] - 1.0]), memory
 
 
 def register(name: str, factory: Factory) -> None:

@@ -49,7 +49,7 @@ def within(tolerance: float, sigma: Float[np.ndarray, " n"]) -> float:
 
 
 def is_above(success: float, bound: float, n: int, n_bound: int = 0) -> bool:
-    """Tell whether a share of `n` episodes is above a bound by four standard errors: a table has some hundred shares.
+    """Tell whether a fraction of `n` episodes is four standard errors above a bound: a table has some hundred of them.
 
     The bound is exact, or itself a fraction of `n_bound` episodes.
     """
@@ -133,10 +133,10 @@ def _on_wet_rail(
     drawn = lambda size: float(size) * (1.0 + spread * generator.uniform(-1.0, 1.0, _DRAWS))  # noqa: E731
     total = []
     for severity in range(int(faults.severity_low), int(faults.severity_high) + 1):
-        share, loss = drawn(faults.wet_share) * severity / 4.0, np.minimum(drawn(faults.wet_loss), 0.95)
-        at_end = np.where(generator.random(_DRAWS) < share, 1.0 - loss, 1.0)
+        fraction, loss = drawn(faults.wet_share) * severity / 4.0, np.minimum(drawn(faults.wet_loss), 0.95)
+        at_end = np.where(generator.random(_DRAWS) < fraction, 1.0 - loss, 1.0)
         for goal, error in zip(distance, sigma, strict=True):
-            patches = generator.binomial(max(1, round(goal / _PATCH)), np.clip(share, 0.0, 1.0))
+            patches = generator.binomial(max(1, round(goal / _PATCH)), np.clip(fraction, 0.0, 1.0))
             needed = goal + _PATCH * patches * loss / (1.0 - loss) + error * generator.standard_normal(_DRAWS)
             total.append(_best_share(needed, tolerance / at_end))
     return float(np.mean(total))

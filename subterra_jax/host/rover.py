@@ -115,14 +115,14 @@ def _add_drive(root: ET.Element) -> None:
     between front and rear.
     """
     wide, tendons, motors = SCRUB * TRACK, _add(root, "tendon"), _add(root, "actuator")
-    share = {"speed": ROLLED / 4, "yaw_rate": ROLLED / (2 * wide)}
+    fraction = {"speed": ROLLED / 4, "yaw_rate": ROLLED / (2 * wide)}
     # A wheel at full speed turns the robot on the spot by the same speed over half the track.
     most = {"speed": SPEED_MAX, "yaw_rate": 2 * SPEED_MAX / wide}
     for name, gain in (("speed", 4 * GAIN / ROLLED**2), ("yaw_rate", GAIN * (wide / ROLLED) ** 2)):
         tendon = _add(tendons, "fixed", name=name)
         for k, wheel in enumerate(WHEELS):
             sign = -1 if name == "yaw_rate" and k % 2 == 0 else 1
-            _add(tendon, "joint", joint=wheel, coef=f"{sign * share[name]:.8g}")
+            _add(tendon, "joint", joint=wheel, coef=f"{sign * fraction[name]:.8g}")
         limits = {"ctrllimited": "true", "ctrlrange": _text(-most[name], most[name])}
         loop = {"gainprm": f"{gain:.8g}", "biastype": "affine", "biasprm": f"0 0 {-gain:.8g}"}
         _add(motors, "general", name=name, tendon=name, dyntype="filterexact", dynprm=f"{LAG:g}", **loop, **limits)

@@ -117,6 +117,6 @@ def _smooth(corners: np.ndarray) -> np.ndarray:
         n = corners.shape[axis]
         place = np.arange(_SIDE) * n / _SIDE
         first = place.astype(int)
-        share = np.expand_dims((place - first) ** 2 * (3.0 - 2.0 * (place - first)), 1 - axis)
-        corners = corners.take(first, axis) * (1.0 - share) + corners.take((first + 1) % n, axis) * share
+        fraction = np.expand_dims((place - first) ** 2 * (3.0 - 2.0 * (place - first)), 1 - axis)
+        corners = corners.take(first, axis) * (1.0 - fraction) + corners.take((first + 1) % n, axis) * fraction
     return corners

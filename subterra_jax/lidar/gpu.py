@@ -210,8 +210,8 @@ def _nearest(wall_ref, first_pair, pairs, middle, direction):
     def segment(start, end, nearest):
         (a, a_ahead), (b, b_ahead) = start, end
         meets = (jnp.minimum(a, b) <= joint) & (jnp.maximum(a, b) >= -joint)
-        share = jnp.clip(a * reciprocal(jnp.where(a == b, 1.0, a - b)), 0.0, 1.0)
-        distance = a_ahead + share * (b_ahead - a_ahead)
+        fraction = jnp.clip(a * reciprocal(jnp.where(a == b, 1.0, a - b)), 0.0, 1.0)
+        distance = a_ahead + fraction * (b_ahead - a_ahead)
         return jnp.where(meets & (distance >= 0.0), jnp.minimum(nearest, distance), nearest)
 
     def two_segments(i, carry):
@@ -278,6 +278,6 @@ def _squared(start, end):
     """Return the square of the distance from the origin to a segment, m²; that to its start if both ends are one."""
     (x, y), (edge_x, edge_y) = start, (end[0] - start[0], end[1] - start[1])
     size = edge_x * edge_x + edge_y * edge_y
-    share = jnp.clip(-(x * edge_x + y * edge_y) / jnp.where(size > 0.0, size, 1.0), 0.0, 1.0)
-    near_x, near_y = x + share * edge_x, y + share * edge_y
+    fraction = jnp.clip(-(x * edge_x + y * edge_y) / jnp.where(size > 0.0, size, 1.0), 0.0, 1.0)
+    near_x, near_y = x + fraction * edge_x, y + fraction * edge_y
     return near_x * near_x + near_y * near_y

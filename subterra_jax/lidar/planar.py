@@ -326,8 +326,8 @@ def _distances(
     # A beam through the joint of two blocks must meet one of them although their ends are rounded apart.
     joint = (2e-7 * (1.0 + jnp.abs(middle_ahead)))[..., None]
     meets = (jnp.minimum(a, b) <= joint) & (jnp.maximum(a, b) >= -joint)
-    share = jnp.clip(a / jnp.where(a == b, 1.0, a - b), 0.0, 1.0)
-    distance = ahead[..., :-1] + share * (ahead[..., 1:] - ahead[..., :-1])
+    fraction = jnp.clip(a / jnp.where(a == b, 1.0, a - b), 0.0, 1.0)
+    distance = ahead[..., :-1] + fraction * (ahead[..., 1:] - ahead[..., :-1])
     return jnp.where(meets & (distance >= 0.0), distance, jnp.inf)
 
 

@@ -150,8 +150,8 @@ def _crosses_triangles(
     for k, point in enumerate(start):
         above = np.sum((point - corner[:, 0]) * normal, axis=1)
         cut = np.flatnonzero((above > 0.0) != (above_end > 0.0))
-        share = above[cut] / (above[cut] - above_end[cut])
-        met = point + share[:, None] * (end - point)
+        fraction = above[cut] / (above[cut] - above_end[cut])
+        met = point + fraction[:, None] * (end - point)
         side = np.sum(np.cross(edges[cut], met[:, None] - corner[cut]) * normal[cut, None], axis=-1)
         crosses[k] = (side >= 0.0).all(axis=1).any()
     return crosses

@@ -258,17 +258,17 @@ def _number_vertices(
 def wedge_edge(number: np.ndarray) -> Float[np.ndarray, "k 2"]:
     """Return the direction in which a wedge begins, left and up; not a unit vector: |left| + |up| is 1."""
     quarter = N_WEDGES // 4
-    turn, share = np.divmod(np.mod(number, N_WEDGES), quarter)
-    share = share / quarter
-    y = np.choose(turn, [1.0 - share, -share, share - 1.0, share])
-    return np.stack([y, np.choose(turn, [share, 1.0 - share, -share, share - 1.0])], axis=-1)
+    turn, fraction = np.divmod(np.mod(number, N_WEDGES), quarter)
+    fraction = fraction / quarter
+    y = np.choose(turn, [1.0 - fraction, -fraction, fraction - 1.0, fraction])
+    return np.stack([y, np.choose(turn, [fraction, 1.0 - fraction, -fraction, fraction - 1.0])], axis=-1)
 
 
 def wedge_place(y: Float[np.ndarray, "*k"], z: Float[np.ndarray, "*k"]) -> Float[np.ndarray, "*k"]:
     """Return the directions of points left and up as numbers of wedges, with fractions."""
     turn = np.where(z >= 0.0, np.where(y > 0.0, 0, 1), np.where(y < 0.0, 2, 3))
-    share = np.where(turn % 2 == 0, np.abs(z), np.abs(y)) / np.maximum(np.abs(y) + np.abs(z), 1e-30)
-    return (turn + share) * (N_WEDGES // 4)
+    fraction = np.where(turn % 2 == 0, np.abs(z), np.abs(y)) / np.maximum(np.abs(y) + np.abs(z), 1e-30)
+    return (turn + fraction) * (N_WEDGES // 4)
 
 
 def _list(
@@ -304,8 +304,8 @@ def _wedges(corner: Float[np.ndarray, "t 3 2"]) -> tuple[Int[np.ndarray, p], Int
     y, z = np.ascontiguousarray(corner.transpose(2, 1, 0))
     (edge_y, edge_z), turn = (np.roll(along, -1, axis=0) - along for along in (y, z)), wedge_place(y, z)
     size = edge_y**2 + edge_z**2
-    share = np.clip(-(y * edge_y + z * edge_z) / np.where(size > 0.0, size, 1.0), 0.0, 1.0)
-    apart = np.sqrt(np.min((y + share * edge_y) ** 2 + (z + share * edge_z) ** 2, axis=0))
+    fraction = np.clip(-(y * edge_y + z * edge_z) / np.where(size > 0.0, size, 1.0), 0.0, 1.0)
+    apart = np.sqrt(np.min((y + fraction * edge_y) ** 2 + (z + fraction * edge_z) ** 2, axis=0))
     swing = np.mod(np.roll(turn, -1, axis=0) - turn + 0.5 * N_WEDGES, N_WEDGES) - 0.5 * N_WEDGES
     # Around the axis, or too near it to tell.
     whole = (np.abs(swing.sum(axis=0)) > 1.0) | (apart < 20.0 * MARGIN)
@@ -335,9 +335,9 @@ def _clip(
     for side, other in (sides, sides[::-1]):
         after, other_after = np.roll(side, -1, axis=0), np.roll(other, -1, axis=0)
         crosses = (side >= 0.0) != (after >= 0.0)
-        share = np.where(crosses, side / np.where(crosses, side - after, 1.0), 0.0)
-        points.append(corner + share * (following - corner))
-        inside.append(crosses & (other + share * (other_after - other) >= -1e-12))
+        fraction = np.where(crosses, side / np.where(crosses, side - after, 1.0), 0.0)
+        points.append(corner + fraction * (following - corner))
+        inside.append(crosses & (other + fraction * (other_after - other) >= -1e-12))
     x, y, z = np.concatenate(points, axis=1)
     middle = begin + end
     return x, y * middle[0] + z * middle[1], np.concatenate(inside)

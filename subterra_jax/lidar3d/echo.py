@@ -74,8 +74,8 @@ def returns(
     """Draw which pulses come back: echoes above the weakest one, faded by a log-normal factor, less those lost."""
     echo = reflectivity * jnp.maximum(cosine, 1e-6) / jnp.maximum(ranges * ranges, 1e-6)
     weakest = jnp.maximum(params.weakest, 1e-12)
-    share = jax.scipy.special.ndtr(jnp.log(echo / weakest) / FADING)
-    return uniform < share * (1.0 - params.lost)
+    fraction = jax.scipy.special.ndtr(jnp.log(echo / weakest) / FADING)
+    return uniform < fraction * (1.0 - params.lost)
 
 
 def rim_of(directions: Float[Array, "n 3"], uniform: Float[Array, "n"], params: EchoParams) -> Float[Array, "n 3"]:

@@ -127,8 +127,8 @@ def wedge_edge(turn: Float[Array, "n"]) -> tuple[Float[Array, "n"], Float[Array,
 
 def wedge_at(tools: Tools, y: Float[Array, "n"], z: Float[Array, "n"]) -> Int[Array, "n"]:
     """Return the wedge in which points lie, as `cells.wedge_place`."""
-    share = y * tools.reciprocal(jnp.maximum(jnp.abs(y) + jnp.abs(z), 1e-30))
-    turn = jnp.where(z >= 0.0, 1.0 - share, 3.0 + share)
+    fraction = y * tools.reciprocal(jnp.maximum(jnp.abs(y) + jnp.abs(z), 1e-30))
+    turn = jnp.where(z >= 0.0, 1.0 - fraction, 3.0 + fraction)
     return jnp.clip((turn * (N_WEDGES / 4)).astype(jnp.int32), 0, N_WEDGES - 1)
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 from subterra_jax.lidar3d.cells import STEP_BITS, X_BITS, YZ_BITS
 from subterra_jax.lidar3d.relief import N_FRAME, N_LINK
 
-# Rays between two triangles must meet one of them although their edges are rounded apart; a share of a triangle's size.
+# Rays between two triangles must meet one of them although their edges are rounded apart; part of a triangle's size.
 # So a ray that passes a free edge as closely meets the triangle too: 0.12 mm beside a sleeper of 2.5 m.
 SEAM = 5e-5
 # A ray may have stepped past a triangle by so much, m.

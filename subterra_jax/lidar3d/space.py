@@ -83,9 +83,9 @@ def ground_at(tunnel: Any, station: Float[Array, ""]) -> tuple[Float[Array, ""],
         return jnp.zeros_like(station), jnp.zeros_like(station)
     place = station / tunnel.spacing
     node = jnp.clip(jnp.floor(place), 0, (tunnel.n_nodes - 2).astype(place.dtype))
-    row, share = tunnel.first_node + node.astype(jnp.int32), place - node
+    row, fraction = tunnel.first_node + node.astype(jnp.int32), place - node
     low, high = tunnel.space.ground[row], tunnel.space.ground[row + 1]
-    return low[0] + share * (high[0] - low[0]), low[1] + share * (high[1] - low[1])
+    return low[0] + fraction * (high[0] - low[0]), low[1] + fraction * (high[1] - low[1])
 
 
 def level_axes(rise: Array, tangent_x: Array, tangent_y: Array, heading: Array) -> tuple[Rows, Rows, Rows]:

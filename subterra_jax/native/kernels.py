@@ -46,10 +46,10 @@ def _meet(wall, n_vertices, block, m_x, m_y, d_x, d_y, ahead, behind):
         while met != _NONE:
             v = first + _U(trailing_zeros(met))
             a, b = _left(wall, n_vertices, v, side, d_x, d_y), _left(wall, n_vertices, v + _U(1), side, d_x, d_y)
-            share = min(max(a / (_ONE if a == b else a - b), _ZERO), _ONE)
+            fraction = min(max(a / (_ONE if a == b else a - b), _ZERO), _ONE)
             start = along + (d_x * wall[v] + d_y * wall[n_vertices + v])
             end = along + (d_x * wall[v + _U(1)] + d_y * wall[n_vertices + v + _U(1)])
-            distance = start + share * (end - start)
+            distance = start + fraction * (end - start)
             ahead = distance if (distance >= _ZERO) & (distance < ahead) else ahead
             behind = -distance if (distance <= _ZERO) & (-distance < behind) else behind
             met = _I(met & (met - 1))
@@ -123,8 +123,8 @@ def _squared(wall, n_vertices, block, m_x, m_y, best):
             edge_x, edge_y = wall[v + _U(1)] - wall[v], wall[n_vertices + v + _U(1)] - wall[n_vertices + v]
             size = edge_x * edge_x + edge_y * edge_y
             # Padding repeats a vertex: a segment of length 0, whose nearest point is its start.
-            share = min(max(-(x * edge_x + y * edge_y) / (size if size > _ZERO else _ONE), _ZERO), _ONE)
-            near_x, near_y = x + share * edge_x, y + share * edge_y
+            fraction = min(max(-(x * edge_x + y * edge_y) / (size if size > _ZERO else _ONE), _ZERO), _ONE)
+            near_x, near_y = x + fraction * edge_x, y + fraction * edge_y
             squared = near_x * near_x + near_y * near_y
             best = squared if squared < best else best
     return best

@@ -144,8 +144,8 @@ def _cross_cells(numbers, first_vertex, first_cell, cell, entry, vertex, p, d, s
     slope = _ONE / ((_F(1e-9) if abs(d[0]) < _F(1e-9) else d[0]) * per_cell)
     onward = p[1] * d[2] - p[2] * d[1] > _ZERO
     x = int(min(max(start, _ZERO), _F(N_X - 1)))
-    share = p[1] / max(abs(p[1]) + abs(p[2]), _F(1e-30))
-    wedge = min(max(int((_ONE - share if p[2] >= _ZERO else _F(3.0) + share) * _PER_TURN), 0), N_WEDGES - 1)
+    fraction = p[1] / max(abs(p[1]) + abs(p[2]), _F(1e-30))
+    wedge = min(max(int((_ONE - fraction if p[2] >= _ZERO else _F(3.0) + fraction) * _PER_TURN), 0), N_WEDGES - 1)
     place, best, which = _ZERO, _FAR, -1
     while True:
         end = x + forward

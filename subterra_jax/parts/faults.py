@@ -92,7 +92,7 @@ def sensing(
 def grip(state: FaultState, station: Float[Array, ""], params: FaultParams) -> Float[Array, ""]:
     """Return true speed over wheel speed at a station: 1 on dry rail."""
     patch = jnp.floor(station / PATCH).astype(jnp.int32)
-    wet = uniform_at(state.seed, patch, _WET) < params.wet_share * _share(state)
+    wet = uniform_at(state.seed, patch, _WET) < params.wet_share * _fraction(state)
     return jnp.where(wet, 1.0 - params.wet_loss, 1.0)
 
 
@@ -100,15 +100,15 @@ def advance_faults(
     state: FaultState, seen: Float[Array, "6"], draw: Float[Array, "k"], n_beams: int, params: FaultParams
 ) -> FaultState:
     """Go one step on: the history moves back by one, faults end or begin; `draw` is uniform in [0, 1)."""
-    share = _share(state)
-    drops = (state.dropout_left <= 0.0) & (draw[0] < params.dropout_rate * share)
-    freezes = (state.freeze_left <= 0.0) & (draw[3] < params.freeze_rate * share)
+    fraction = _fraction(state)
+    drops = (state.dropout_left <= 0.0) & (draw[0] < params.dropout_rate * fraction)
+    freezes = (state.freeze_left <= 0.0) & (draw[3] < params.freeze_rate * fraction)
     left = jnp.maximum(state.dropout_left - 1.0, 0.0)
     return dataclasses.replace(
         state,
         seen=jnp.concatenate([seen[None], state.seen[:-1]]),
         dropout_left=jnp.where(
-            drops, jnp.ceil(params.dropout_steps * _again(draw[0], params.dropout_rate * share)), left
+            drops, jnp.ceil(params.dropout_steps * _again(draw[0], params.dropout_rate * fraction)), left
         ),
         dropout_first=jnp.where(drops, jnp.floor(draw[1] * n_beams), state.dropout_first),
         dropout_count=jnp.where(drops, jnp.ceil(draw[2] * params.dropout_share * n_beams), state.dropout_count),
@@ -120,7 +120,7 @@ def advance_faults(
 
 def observed(state: FaultState, params: FaultParams) -> Float[Array, "6"]:
     """Return the row of `FaultState.seen` that is observed: the newest, or a late one."""
-    delay = jnp.clip(jnp.round(params.delay * _share(state)), 0, MAX_DELAY).astype(jnp.int32)
+    delay = jnp.clip(jnp.round(params.delay * _fraction(state)), 0, MAX_DELAY).astype(jnp.int32)
     return state.seen[delay]
 
 
@@ -133,7 +133,7 @@ def corrupt(
 ) -> Float[Array, "n_beams"]:
     """Apply dust and drop-outs to true ranges; a lost beam reports exactly `range_max`."""
     n_beams = ranges.shape[0]
-    rate = params.dust_rate * _share(state)
+    rate = params.dust_rate * _fraction(state)
     dust = draw[_N_OWN : _N_OWN + n_beams]
     dusty = jnp.where(dust < rate, ranges * _again(dust, rate), ranges)
     return jnp.where(_dropped(state, n_beams), range_max, dusty)
@@ -145,7 +145,7 @@ def _dropped(state: FaultState, n_beams: int) -> Bool[Array, "n_beams"]:
     return (state.dropout_left > 0.0) & (behind < state.dropout_count)
 
 
-def _share(state: FaultState) -> Float[Array, ""]:
+def _fraction(state: FaultState) -> Float[Array, ""]:
     return state.severity / (N_SEVERITIES - 1)
 
 
@@ -214,8 +214,8 @@ class Faults(Part):
 
     def drive(self, own: FaultState, drive: Drive, state: State, params: EnvParams) -> Drive:
         """Take speed from the robot on wet rail, and none from its wheels; those of a frozen odometer seem to stand."""
-        share = grip(own, state.station, self.sizes(own, params))
-        motion = jnp.stack([drive.motion[0] * share, drive.motion[1]])
+        fraction = grip(own, state.station, self.sizes(own, params))
+        motion = jnp.stack([drive.motion[0] * fraction, drive.motion[1]])
         return Drive(jnp.where(own.freeze_left > 0.0, 0.0, drive.wheels), motion)
 
     def advance(self, own: FaultState, step: Step, noise: Noise, params: EnvParams) -> FaultState:

@@ -40,8 +40,8 @@ def advance_wander(
     # The root has no derivative at 0: a standing robot gets 0, and neither branch a NaN.
     moves = ratio > 0.0
     # expm1, because 1 - exp(-x) has few digits left at a step of 0.2 m in 30 m.
-    share = jnp.where(moves, jnp.sqrt(-jnp.expm1(-2.0 * jnp.where(moves, ratio, 1.0))), 0.0)
-    return jnp.exp(-ratio) * value + params.sigma * share * noise
+    fraction = jnp.where(moves, jnp.sqrt(-jnp.expm1(-2.0 * jnp.where(moves, ratio, 1.0))), 0.0)
+    return jnp.exp(-ratio) * value + params.sigma * fraction * noise
 
 
 @struct.dataclass

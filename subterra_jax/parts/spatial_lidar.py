@@ -170,7 +170,7 @@ class Sweeping:
 
 
 def along_arc(
-    start: Sweeping, position: Float[Array, "2"], heading: Float[Array, ""], share: Float[Array, "n"]
+    start: Sweeping, position: Float[Array, "2"], heading: Float[Array, ""], fraction: Float[Array, "n"]
 ) -> tuple[Float[Array, "n 2"], Float[Array, "n"]]:
     """Return poses (m, rad) at fractions of the way from one pose to another, by a constant speed and yaw rate."""
     turn = wrap(heading - start.heading)
@@ -178,11 +178,11 @@ def along_arc(
     small = jnp.abs(turn) < 1e-3
     half = jnp.where(small, 1.0, 0.5 * turn)
     # A chord of the arc is as the sine of half its turn, and points half its turn past the first heading.
-    size = jnp.where(small, share, jnp.sin(half * share) / jnp.sin(half))
-    back = 0.5 * turn * (share - 1.0)
+    size = jnp.where(small, fraction, jnp.sin(half * fraction) / jnp.sin(half))
+    back = 0.5 * turn * (fraction - 1.0)
     cos, sin = size * jnp.cos(back), size * jnp.sin(back)
     x, y = cos * chord_x - sin * chord_y, sin * chord_x + cos * chord_y
-    return start.position + jnp.stack([x, y], axis=-1), start.heading + share * turn
+    return start.position + jnp.stack([x, y], axis=-1), start.heading + fraction * turn
 
 
 @dataclasses.dataclass(frozen=True)
@@ -221,8 +221,8 @@ class SpatialLidar(Part):
         if not sensor.sweep:
             place, axes = stand(sensing.tunnel, sensing.position, sensing.heading, sensing.station, sensor.mount)
             return jnp.broadcast_to(place, (sensor.n_beams, 3)), into_tunnel(axes, sensor.directions)
-        share = 1.0 + sensor.times / jnp.asarray(params.vehicle.period)
-        position, heading = along_arc(own, sensing.position, sensing.heading, share)
+        fraction = 1.0 + sensor.times / jnp.asarray(params.vehicle.period)
+        position, heading = along_arc(own, sensing.position, sensing.heading, fraction)
         tunnel = sensing.tunnel
         _, _, tangent_x, tangent_y, _ = at_station(tunnel, sensing.station)
         away = position - sensing.position

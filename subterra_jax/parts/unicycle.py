@@ -99,8 +99,8 @@ def _nearest_points(
     edge_x, edge_y = x1 - x0, y1 - y0
     size = edge_x * edge_x + edge_y * edge_y
     # Padding repeats a vertex: a segment of length 0, whose nearest point is its start.
-    share = jnp.clip(-(x0 * edge_x + y0 * edge_y) / jnp.where(size > 0.0, size, 1.0), 0.0, 1.0)
-    return x0 + share * edge_x, y0 + share * edge_y
+    fraction = jnp.clip(-(x0 * edge_x + y0 * edge_y) / jnp.where(size > 0.0, size, 1.0), 0.0, 1.0)
+    return x0 + fraction * edge_x, y0 + fraction * edge_y
 
 
 def _by(kernel: Callable[..., Array]) -> Callable[..., Array]:

@@ -258,9 +258,9 @@ def _frame_at(window: Window, centre: Float[Array, "3"]) -> tuple[Array, Array, 
     chord = chord / jnp.sqrt(jnp.sum(chord * chord))
     along, place = jnp.sum(position * chord, axis=1), jnp.sum(centre * chord)
     row = jnp.sum((place > along[1:-1]).astype(jnp.int32))
-    share = (place - along[row]) / (along[row + 1] - along[row])
-    origin = position[row] + share * (position[row + 1] - position[row])
-    left, up = (axes[row, i] + jnp.clip(share, 0.0, 1.0) * (axes[row + 1, i] - axes[row, i]) for i in (1, 2))
+    fraction = (place - along[row]) / (along[row + 1] - along[row])
+    origin = position[row] + fraction * (position[row + 1] - position[row])
+    left, up = (axes[row, i] + jnp.clip(fraction, 0.0, 1.0) * (axes[row + 1, i] - axes[row, i]) for i in (1, 2))
     nearest = jnp.argmin(jnp.abs(along - place))
     return origin, left, up, (position[nearest], axes[nearest])
 

@@ -185,11 +185,11 @@ def _wall_picture(piece: Piece, shell: Shell, seed: int) -> tuple[np.ndarray, tu
 def _noise_picture() -> np.ndarray:
     """Return a grey picture of stains that repeats at its edges, `(n, n, 3)` uint8."""
     shade = np.full((_PIXELS, _PIXELS), 0.86)
-    for share, size, seed in ((0.03, 1.5, 0), (0.05, 12.0, 1), (0.05, 45.0, 2)):
+    for fraction, size, seed in ((0.03, 1.5, 0), (0.05, 12.0, 1), (0.05, 45.0, 2)):
         white = np.fft.rfft2(np.random.default_rng(seed).standard_normal(shade.shape))
         v, u = np.fft.fftfreq(_PIXELS)[:, None] * size, np.fft.rfftfreq(_PIXELS)[None, :] * size
         field = np.fft.irfft2(white * np.exp(-2.0 * np.pi**2 * (v**2 + u**2)), shade.shape)
-        shade += share * field / field.std()
+        shade += fraction * field / field.std()
     return np.repeat(np.clip(255.0 * shade, 0.0, 255.0).astype(np.uint8)[..., None], 3, axis=2)
 
 

@@ -18,7 +18,7 @@ _STEEL, _SLEEPER, _FURNITURE = (0.40, 0.33, 0.28), (0.62, 0.61, 0.58), (0.38, 0.
 _LEVEL = 0.7  # cosine of the steepest floor
 _SUNK, _RIM = 0.02, 0.03  # m behind the smooth wall and beyond a recess's sides, to which its points belong to it
 AROUND = 6.0  # m of shell kept beyond the piece, so that recesses at its ends are whole
-_THIN = 0.06  # m; a part of the track whose half width is less is a rail
+_THIN = 0.08  # m; a part of the track whose half width is less is a rail: feet have 0.075
 
 
 @dataclasses.dataclass(frozen=True)

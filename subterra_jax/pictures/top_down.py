@@ -36,8 +36,8 @@ def _along(start: np.ndarray, end: np.ndarray, step: float) -> np.ndarray:
     count = np.maximum(1, np.ceil(np.linalg.norm(end - start, axis=1) / step)).astype(int) + 1
     owner = np.repeat(np.arange(len(start)), count)
     place = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-    share = (place / (count[owner] - 1))[:, None]
-    return start[owner] + share * (end[owner] - start[owner])
+    fraction = (place / (count[owner] - 1))[:, None]
+    return start[owner] + fraction * (end[owner] - start[owner])
 
 
 def _filled(boxes: Sequence[Boxes], position: np.ndarray, view: float, step: float) -> np.ndarray:

@@ -175,7 +175,7 @@ def to_action(
 ) -> Float[Array, "*batch action"]:
     """Returns the action of a draw of the Gaussian, within its bounds, m/s and rad/s.
 
-    A range that begins at 0 is stretched below it by a share `standing` of its end, and clipped: to stand is then a
+    A range that begins at 0 is stretched below it by a fraction `standing` of its end, and clipped: to stand is then a
     region and not the limit of a tanh.
     """
     lowest = jnp.where(low == 0.0, -standing * high, low)

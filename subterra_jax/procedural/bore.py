@@ -157,8 +157,8 @@ def _bolt_pockets(
     station = np.broadcast_to(middle[:, None, None], turned.shape)
     within = np.stack([station, turned], axis=-1).reshape(-1, 2)
     place = np.concatenate([at_joint, within])
-    share = 0.95 if rng.random() < ranges.grouted_share else float(rng.uniform(*ranges.missing))
-    there = rng.random(len(place)) >= share
+    fraction = 0.95 if rng.random() < ranges.grouted_share else float(rng.uniform(*ranges.missing))
+    there = rng.random(len(place)) >= fraction
     reach = 0.5 * size[0] + _END
     there &= (place[:, 0] > reach) & (place[:, 0] < length - reach)
     rows = np.column_stack([place, np.broadcast_to(size, (len(place), 3))])

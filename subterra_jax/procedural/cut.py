@@ -41,8 +41,8 @@ def plane_walls(bore: Bore, smooth: bool = False) -> Cut:
         upper = np.clip(np.argmax(above > 0.0, axis=1), 1, len(columns) - 1)
         rows = np.arange(len(radius))
         low, high = above[rows, upper - 1], above[rows, upper]
-        share = -low / (high - low)
-        cut[name] = side * (y[rows, upper - 1] + share * (y[rows, upper] - y[rows, upper - 1]))
+        fraction = -low / (high - low)
+        cut[name] = side * (y[rows, upper - 1] + fraction * (y[rows, upper] - y[rows, upper - 1]))
     return cut
 
 

@@ -80,8 +80,8 @@ class Rings:
         joint = joint[joint < length]
         segments = int(rng.integers(ranges.segments[0], ranges.segments[1] + 1))
         # The key is a third as wide as the others.
-        share = np.concatenate([[1.0 / 3.0], np.ones(segments - 1)])
-        edge = 2.0 * np.pi * np.cumsum(share / share.sum())
+        fraction = np.concatenate([[1.0 / 3.0], np.ones(segments - 1)])
+        edge = 2.0 * np.pi * np.cumsum(fraction / fraction.sum())
         first = rng.uniform(0.0, 2.0 * np.pi)
         places = rng.integers(0, bolts, len(joint) + 1) if ranges.turned else np.zeros(len(joint) + 1)
         return cls(
@@ -128,8 +128,8 @@ class Stretches:
         """Return the places of the stretches, m; a flare is as much too narrow at one end as too wide at the other."""
         which = np.searchsorted(self.joint, grid.station)
         ends = np.concatenate([[0.0], self.joint, grid.station[-1:] + 1e-9])
-        share = (grid.station - ends[which]) / (ends[which + 1] - ends[which])
-        along = self.offset[which] + self.flare * (share - 0.5)
+        fraction = (grid.station - ends[which]) / (ends[which + 1] - ends[which])
+        along = self.offset[which] + self.flare * (fraction - 0.5)
         angle = grid.bearing[columns]
         aside = self.shift[which] @ np.stack([np.cos(angle), np.sin(angle)])
         return along[:, None] + aside

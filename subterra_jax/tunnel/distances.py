@@ -54,8 +54,8 @@ def _nearest_hits(
     g_x, g_y = start[:, 0] - origin[:, :1], start[:, 1] - origin[:, 1:]
     size = d_x * edge[:, 1] - d_y * edge[:, 0]
     safe = np.where(np.abs(size) < 1e-12, 1.0, size)
-    along, share = (g_x * edge[:, 1] - g_y * edge[:, 0]) / safe, (g_x * d_y - g_y * d_x) / safe
-    meets = (np.abs(size) >= 1e-12) & (share >= -1e-9) & (share <= 1.0 + 1e-9) & (along >= 0.0)
+    along, fraction = (g_x * edge[:, 1] - g_y * edge[:, 0]) / safe, (g_x * d_y - g_y * d_x) / safe
+    meets = (np.abs(size) >= 1e-12) & (fraction >= -1e-9) & (fraction <= 1.0 + 1e-9) & (along >= 0.0)
     return np.where(meets, along, np.inf).min(axis=1, initial=np.inf)
 
 

@@ -84,6 +84,6 @@ def make_bricks(
 def brick_corners(brick: Float[np.ndarray, "k 13"]) -> Float[np.ndarray, "k 8 3"]:
     """Return the corners of bricks, m; bit 2 of a corner's number is along, bit 1 left, bit 0 up."""
     half, taper = brick[:, 3:12].reshape(-1, 3, 3), brick[:, 12]
-    share = np.repeat(_CORNERS[None], len(brick), axis=0)
-    share[..., 0] *= 1.0 - taper[:, None] * share[..., 2]
-    return brick[:, None, :3] + np.einsum("kci,kij->kcj", share, half)
+    fraction = np.repeat(_CORNERS[None], len(brick), axis=0)
+    fraction[..., 0] *= 1.0 - taper[:, None] * fraction[..., 2]
+    return brick[:, None, :3] + np.einsum("kci,kij->kcj", fraction, half)

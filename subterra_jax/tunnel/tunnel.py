@@ -199,10 +199,10 @@ def at_station(tunnel: Tunnel, station: Float[Array, ""]) -> Float[Array, "5"]:
     """Return centre x, y (m), unit tangent x, y and half width (m) at a station; straight on beyond the mouths."""
     place = station / tunnel.spacing
     node = jnp.clip(jnp.floor(place), 0, (tunnel.n_nodes - 2).astype(place.dtype))
-    index, share = node.astype(jnp.int32), place - node
+    index, fraction = node.astype(jnp.int32), place - node
     row = tunnel.first_node + index
     lower, upper = tunnel.grid[row], tunnel.grid[row + 1]
-    return lower + share * (upper - lower)
+    return lower + fraction * (upper - lower)
 
 
 def beside(

@@ -55,8 +55,8 @@ def write_page(path: Path, drawn: Drawn, shapes: list[Shape], radius: float, fac
         serializer = server.get_scene_serializer()
         for row in range(len(drawn)):
             player.show(row)
-            for share in range(_FRAMES if row + 1 < len(drawn) else 1):
-                player.move(row, share / _FRAMES)
+            for part in range(_FRAMES if row + 1 < len(drawn) else 1):
+                player.move(row, part / _FRAMES)
                 serializer.insert_sleep(drawn.trace.period / _FRAMES)
         page = serializer.as_html(dark_mode=True)
     with replace_file(path) as part:
@@ -119,16 +119,16 @@ class _Player:
         if row % _STATUS_EVERY == 0 or row == len(drawn) - 1:
             self._status.text = _status(drawn, row)
 
-    def move(self, row: int, share: float) -> None:
+    def move(self, row: int, fraction: float) -> None:
         """Move the tunnel past the robot, to a fraction of the way to the next row."""
-        position, heading = self._drawn.pose(row + share)
+        position, heading = self._drawn.pose(row + fraction)
         back = Rotation.from_euler("z", -heading)
         self._world.position, self._world.wxyz = -back.apply(position), _about_z(-heading)
-        position, heading = self._drawn.pose(row + share, reckoned=True)
+        position, heading = self._drawn.pose(row + fraction, reckoned=True)
         self._ghost.position, self._ghost.wxyz = position, _about_z(heading)
         if self._legs is not None:
             poses = self._drawn.trace.pose[min(row + 1, len(self._drawn) - 1)]
-            self._legs.place(poses[min(int(share * len(poses)), len(poses) - 1)])
+            self._legs.place(poses[min(int(fraction * len(poses)), len(poses) - 1)])
 
     def _add_trails(self, row: int) -> None:
         rows = np.arange(row - 1 - (row - 1) % _TRAIL, row + 1)

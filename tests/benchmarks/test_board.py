@@ -245,7 +245,7 @@ def test_a_batch_takes_no_more_than_the_memory_that_it_may_unless_it_is_one_epis
     # From here on by a line through both, since each other size would be compiled.
     line = lambda n: few + (many - few) * (n - 16) / 48  # noqa: E731
     monkeypatch.setattr(Driver, "bytes_needed", lambda self, params, agent, n, n_steps: line(n))
-    for share, least, most in ((1.0, 64, 64), (0.4, 2, 39), (1e-9, 1, 1)):
-        found = harness.fitting_batch(env, params, agent, 64, 1e-9 * share * many)
+    for fraction, least, most in ((1.0, 64, 64), (0.4, 2, 39), (1e-9, 1, 1)):
+        found = harness.fitting_batch(env, params, agent, 64, 1e-9 * fraction * many)
         assert least <= found <= most
-        assert found == 1 or line(found) <= share * many
+        assert found == 1 or line(found) <= fraction * many

@@ -100,7 +100,7 @@ def test_a_row_of_sleepers_is_no_chance_with_any_true_pitch_and_some_unseen(pitc
 
 
 FILLED = 8  # every so many places: a pocket mortared flush, where the mortar gives half of the echoes
-BEYOND, THIN = 0.30, 0.75  # m from a pocket away from its joint; share of the echoes that is missing there
+BEYOND, THIN = 0.30, 0.75  # m from a pocket away from its joint; fraction of the echoes that is missing there
 MOUTH = JOINTS[0] - OFFSET - HALF[0] - 0.05  # m: the first pockets begin 5 cm behind it
 
 
@@ -127,9 +127,9 @@ def mortared() -> tuple[np.ndarray, np.ndarray]:
     radius, seen = np.full(len(station), RADIUS), np.ones(len(station), bool)
     for at in place[~filled]:
         radius[near(station, angle, at)] = RADIUS + DEPTH
-    for share, bare in ((0.5, place[filled]), (THIN, spot)):
+    for fraction, bare in ((0.5, place[filled]), (THIN, spot)):
         for at in bare:
-            seen &= ~(near(station, angle, at) & (radius == RADIUS) & (rng.random(len(station)) < share))
+            seen &= ~(near(station, angle, at) & (radius == RADIUS) & (rng.random(len(station)) < fraction))
     points = np.stack([station, radius * np.cos(angle), radius * np.sin(angle)], axis=1)[seen]
     return points + rng.normal(0, 0.004, points.shape) + 40.0, place[~filled]
 
@@ -159,27 +159,27 @@ def test_thin_walls_and_filled_pockets_are_none_and_every_open_one_is(wall, monk
     assert count_hits(wall)[1] > 5, "this wall does not try the evidence"
 
 
-MEAN, BY_CHANCE = 2.0, 0.05  # points on the wall in a cell, and the share of the cells with a return behind it
+MEAN, BY_CHANCE = 2.0, 0.05  # points on the wall in a cell, and the fraction of the cells with a return behind it
 EVERY, SIZE = 12, (0.10, 0.10)  # cells between two places; m, so that 5 × 5 cells tell
 
 
 def drawn(seed: int, left: float = 0.5, behind: float = 0.15) -> tuple[SimpleNamespace, Holes, np.ndarray]:
     """A wall drawn by the model itself, and holes: clear pockets (0), faint ones (1) and wall (2).
 
-    In pockets a share of the points is left, and so many cells more have a return behind them.
+    In pockets a fraction of the points is left, and so many cells more have a return behind them.
     """
     rng = np.random.default_rng(seed)
     row, column = (k.ravel() for k in np.meshgrid(np.arange(8, 1000, EVERY), np.arange(6, 360, EVERY), indexing="ij"))
     kind = rng.integers(0, 3, len(row))
-    points, share = np.full((1000, 360), MEAN), np.full((1000, 360), BY_CHANCE)
+    points, fraction = np.full((1000, 360), MEAN), np.full((1000, 360), BY_CHANCE)
     for r, c, k in zip(row, column, kind, strict=True):
         if k < 2:  # the middle of a faint one may be a cell off
             r, c = np.array([r, c]) + (rng.integers(-1, 2, 2) if k else 0)
             points[r - 1 : r + 2, c - 1 : c + 2] = left * MEAN
-            share[r - 1 : r + 2, c - 1 : c + 2] = 1 - (1 - behind) * (1 - BY_CHANCE)
+            fraction[r - 1 : r + 2, c - 1 : c + 2] = 1 - (1 - behind) * (1 - BY_CHANCE)
     sections = SimpleNamespace(
         grid=Grid(0.0, 0.05, 1000, 360), radius=np.full((1000, 360), 2.75), support=rng.poisson(points).astype(float),
-        deepest=0.1 * (rng.random(share.shape) < share),
+        deepest=0.1 * (rng.random(fraction.shape) < fraction),
     )  # fmt: skip
     return sections, Holes(row, column, np.where(kind == 0, 0.5, 0.2)), kind
 

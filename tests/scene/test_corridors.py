@@ -40,15 +40,15 @@ def furniture(kind: str) -> list[Thing]:
     rng = np.random.default_rng(7)
     things, at = [], 0.8
     while at + long < LENGTH - 0.5:
-        share = rng.uniform(0.8, 1.2, 3)
+        fraction = rng.uniform(0.8, 1.2, 3)
         things.append(
             (
-                (at, at + long * share[0]),
-                (-WIDTH / 2, -WIDTH / 2 + depth * share[1]),
-                (low, min(low + (high - low) * share[2], HEIGHT - 0.01)),
+                (at, at + long * fraction[0]),
+                (-WIDTH / 2, -WIDTH / 2 + depth * fraction[1]),
+                (low, min(low + (high - low) * fraction[2], HEIGHT - 0.01)),
             )
         )
-        at += long * share[0] + gap * rng.uniform(0.7, 1.3)
+        at += long * fraction[0] + gap * rng.uniform(0.7, 1.3)
     return things
 
 

@@ -51,8 +51,8 @@ def cast(lines: np.ndarray, origin: np.ndarray, direction: np.ndarray) -> float:
     across = direction[0] * edge[:, 1] - direction[1] * edge[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = (a[:, 0] * edge[:, 1] - a[:, 1] * edge[:, 0]) / across
-        share = (a[:, 0] * direction[1] - a[:, 1] * direction[0]) / across
-    hit = (distance > 0) & (share >= 0) & (share <= 1)
+        fraction = (a[:, 0] * direction[1] - a[:, 1] * direction[0]) / across
+    hit = (distance > 0) & (fraction >= 0) & (fraction <= 1)
     return float(np.min(distance[hit], initial=30.0))
 
 

@@ -42,8 +42,8 @@ def wall(bore) -> np.ndarray:
 
 def test_returns_on_the_wall_are_explained_and_nothing_is_said(bore, wall):
     judgement = judge_bore(bore, cloud_of(wall), JudgingConfig())
-    assert judgement.shares["explained"] > 0.999
-    assert judgement.coverage.share == 1.0
+    assert judgement.fractions["explained"] > 0.999
+    assert judgement.coverage.fraction == 1.0
     assert not judgement.warnings
     assert not judgement.places
 
@@ -85,8 +85,8 @@ def test_pockets_and_track_explain_what_is_in_them(bore):
 def test_what_lies_beyond_the_ends_is_counted_apart(bore, wall):
     outside = about(bore, np.full(600, -4.0), np.linspace(-5, 5, 600), np.zeros(600))
     judgement = judge_bore(bore, cloud_of(wall, outside), JudgingConfig())
-    assert judgement.shares["beyond_ends"] == pytest.approx(600 / 60_600, abs=1e-4)
-    assert judgement.shares["inside"] + judgement.shares["behind"] < 1e-3
+    assert judgement.fractions["beyond_ends"] == pytest.approx(600 / 60_600, abs=1e-4)
+    assert judgement.fractions["inside"] + judgement.fractions["behind"] < 1e-3
     assert (judgement.returns.kind[-600:] == BEYOND).all()
     near = about(bore, [-0.3, bore.length + 0.3], [0.0, 0.0], [0.0, 0.0])
     assert (compare_returns(bore, cloud_of(near), 0.10).kind == BEYOND).all()
@@ -142,7 +142,7 @@ def test_strays_do_not_count_as_having_seen_a_wall(bore):
     few = np.random.default_rng(2).random(60_000) < 0.01
     judgement = judged_without(bore, lambda station, *_: (station > 8) & (station < 18) & ~few)
     assert judgement.coverage.pieces[0].sides == "all around"
-    assert judgement.coverage.share == pytest.approx(14 / 24, abs=0.08)
+    assert judgement.coverage.fraction == pytest.approx(14 / 24, abs=0.08)
 
 
 def test_a_bore_that_explains_too_little_is_refused_unless_forced(bore, wall):
@@ -163,7 +163,7 @@ def test_what_was_cut_away_as_another_tunnel_refuses_nothing(bore, wall):
     assert any(w.refuses for w in judge_bore(bore, cloud, JudgingConfig()).warnings)
     judgement = judge_bore(bore, cloud, JudgingConfig(), cause=cause)
     assert not any(w.refuses for w in judgement.warnings)
-    assert judgement.shares["behind"] == pytest.approx(0.5, abs=0.01)
+    assert judgement.fractions["behind"] == pytest.approx(0.5, abs=0.01)
 
 
 @pytest.mark.parametrize(("overhead", "length", "said"), [(False, 8.0, False), (True, 1.2, False), (True, 8.0, True)])

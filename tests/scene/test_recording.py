@@ -36,11 +36,11 @@ def test_an_absent_topic_is_named(tmp_path):
         Recording(write_bag(tmp_path / "a.bag", SCANS), topic="/other")
 
 
-@pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.7, 0.99])
-def test_a_bag_truncated_anywhere_is_refused(tmp_path, share):
+@pytest.mark.parametrize("fraction", [0.0, 0.01, 0.3, 0.7, 0.99])
+def test_a_bag_truncated_anywhere_is_refused(tmp_path, fraction):
     whole = write_bag(tmp_path / "a.bag", SCANS).read_bytes()
     cut = tmp_path / "cut.bag"
-    cut.write_bytes(whole[: int(share * len(whole))])
+    cut.write_bytes(whole[: int(fraction * len(whole))])
     with pytest.raises(RecordingError, match=r"cut\.bag"), Recording(cut) as recording:
         list(recording.scans())
 

@@ -55,11 +55,11 @@ def hits(distance: float, cosine: float, n: int) -> Hits:
     return Hits(*full, np.full(n, Part.LINING, np.uint8), np.zeros((n, 3), np.float32))
 
 
-def mix(share: float, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def mix(fraction: float, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Reported and true distances along x of beams at `y`, m."""
     walls, lidar = two_walls(), os1()
     origin, ray, seen = looked(walls, y)
-    distance = mix_pixels(np.random.default_rng(3), lidar, share, walls, origin, ray, seen)
+    distance = mix_pixels(np.random.default_rng(3), lidar, fraction, walls, origin, ray, seen)
     return distance * ray[:, 0], seen.distance * ray[:, 0]
 
 
@@ -104,21 +104,21 @@ def test_range_noise_grows_with_range_and_incidence() -> None:
 def test_echoes_too_weak_are_lost_and_can_be_kept(lidar: Lidar) -> None:
     rng, n = np.random.default_rng(0), 4000
 
-    def share(errors: SensorErrors, distance: float, cosine: float) -> float:
+    def fraction(errors: SensorErrors, distance: float, cosine: float) -> float:
         return draw_returns(rng, lidar, errors, hits(distance, cosine, n)).mean()
 
     given = SensorErrors()
     middle = (0.3 * 2.8 / lidar.weakest_echo) ** (1 / 3)
     far = 2.0 * middle
-    assert share(given, 5.0, 0.8) > 0.99
-    assert share(given, far, 2.8 / far) < 0.01
-    assert share(given, middle, 2.8 / middle) == pytest.approx(0.498, abs=3 * 0.5 / np.sqrt(n))
+    assert fraction(given, 5.0, 0.8) > 0.99
+    assert fraction(given, far, 2.8 / far) < 0.01
+    assert fraction(given, middle, 2.8 / middle) == pytest.approx(0.498, abs=3 * 0.5 / np.sqrt(n))
     all_kept = replace(given, weak_echoes=False, lost=0.0)
-    assert share(all_kept, far, 2.8 / far) == 1.0
+    assert fraction(all_kept, far, 2.8 / far) == 1.0
     some = replace(given, weak_echoes=False, lost=0.1)
-    assert share(some, far, 2.8 / far) == pytest.approx(0.9, abs=3 * np.sqrt(0.09 / n))
+    assert fraction(some, far, 2.8 / far) == pytest.approx(0.9, abs=3 * np.sqrt(0.09 / n))
     for place in ((5.0, -0.5), (lidar.range_max + 1, 1.0), (np.inf, 1.0), (0.2, 1.0)):
-        assert share(all_kept, *place) == 0.0
+        assert fraction(all_kept, *place) == 0.0
 
 
 class Sending(ExitStack):

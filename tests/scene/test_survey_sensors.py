@@ -195,7 +195,7 @@ def test_with_all_errors_off_the_instruments_tell_the_truth(tmp_path: Path) -> N
 def test_without_distortion_a_sweep_is_measured_at_its_stamp(tmp_path: Path) -> None:
     still = make(tmp_path / "still", "--sensors", "vlp16", *PERFECT, "--errors.no-distortion")
     moving = make(tmp_path / "moving", "--sensors", "vlp16", *PERFECT)
-    cast, share = load_cast(still / "truth.ply"), []
+    cast, fraction = load_cast(still / "truth.ply"), []
     for folder in (still, moving):
         trajectory = load_trajectory(folder / "groundtruth_vlp16.tum")
         _, message = messages(folder / "survey_vlp16.bag", "/velodyne_points")[6]
@@ -204,7 +204,7 @@ def test_without_distortion_a_sweep_is_measured_at_its_stamp(tmp_path: Path) -> 
         position, attitude = trajectory.at(np.full(len(points), at))
         local = np.stack([points[k].astype(float) for k in "xyz"], axis=-1)
         reach = np.linalg.norm(local, axis=1)
-        share.append((abs(reach - cast(position, attitude.apply(local / reach[:, None]))) < 2e-3).mean())
+        fraction.append((abs(reach - cast(position, attitude.apply(local / reach[:, None]))) < 2e-3).mean())
         assert points["time"].any() == (folder == moving)
-    assert share[0] > 0.995
-    assert share[1] < 0.5
+    assert fraction[0] > 0.995
+    assert fraction[1] < 0.5

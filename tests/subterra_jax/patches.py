@@ -16,15 +16,15 @@ def patches(station, seed=3):
     return np.where(np.searchsorted(edges, station) % 2 == 0, 0.06, 0.0)
 
 
-def drive_past(share, sigma=0.02, seed=0):
+def drive_past(fraction, sigma=0.02, seed=0):
     """A robot in the middle of a straight tunnel that drives (1 + share) times what is commanded."""
     driven = 0.2 * np.arange(5 * N_METRES + 2)
     angle = np.deg2rad(22.5) * np.arange(1, 8)
     along = np.broadcast_to(HALF / np.tan(angle), (len(driven), 2, 7))
-    station = (1.0 + share) * driven[:, None, None] + along + np.array([0.0, 7.3])[:, None]
+    station = (1.0 + fraction) * driven[:, None, None] + along + np.array([0.0, 7.3])[:, None]
     noise = sigma * np.random.default_rng(seed).standard_normal(station.shape)
     points = Points(jnp.asarray(along), jnp.asarray(patches(station) + noise), jnp.ones(station.shape, bool))
-    return streams.Record(jnp.asarray(driven), jnp.asarray((1.0 + share) * driven), points)
+    return streams.Record(jnp.asarray(driven), jnp.asarray((1.0 + fraction) * driven), points)
 
 
 def map_of_walls(first=0.0, n_metres=160, seed=3, side=7.3):

@@ -40,16 +40,16 @@ def test_a_memory_gives_the_same_metre_by_metre_as_all_at_once():
     whole = memory.sequence(weights, blocks)
     one = lambda state, block: memory.step(weights, state, block)  # noqa: E731
     stepped = jax.lax.scan(one, memory.start(), blocks)[1]
-    for name in ("correction", "share", "log_scale"):
+    for name in ("correction", "fraction", "log_scale"):
         np.testing.assert_allclose(getattr(whole, name), getattr(stepped, name), atol=2e-4)
 
 
-def _ranges(driven, share=0.01):
+def _ranges(driven, fraction=0.01):
     """Scans of 16 beams by a robot that keeps to the middle; the ends of the tunnel are out of sight."""
     angle = 2.0 * np.pi * np.arange(16) / 16
     side = np.where(np.abs(np.sin(angle)) < 0.1, np.nan, np.abs(np.sin(angle)))
     along = HALF * np.cos(angle) / side
-    station = (1.0 + share) * driven[:, None] + along + np.where(np.sin(angle) > 0.0, 0.0, 7.3)
+    station = (1.0 + fraction) * driven[:, None] + along + np.where(np.sin(angle) > 0.0, 0.0, 7.3)
     noise = 0.02 * np.random.default_rng(5).standard_normal(station.shape)
     return np.where(np.isnan(side), 30.0, (HALF + patches(station) + noise) / np.where(np.isnan(side), 1.0, side))
 
@@ -199,8 +199,8 @@ def test_a_way_back_begins_at_the_place_that_the_flag_tells():
     assert stations[139] == pytest.approx(stations[70] - 0.2 * 69, abs=0.4)
 
 
-def _beliefs(weights, share, reported, sigma, strip, passed):
-    record = jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype != bool else x, drive_past(share))
+def _beliefs(weights, fraction, reported, sigma, strip, passed):
+    record = jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype != bool else x, drive_past(fraction))
     return _sequence(weights, record, strip, np.float32(reported), np.float32(sigma), passed)
 
 
@@ -212,14 +212,14 @@ def _sequence(weights, record, strip, reported, sigma, passed):
 
 
 # The relief is met from station 0 of `patches` on; the map begins 50 m before.
-@pytest.mark.parametrize(("offset", "share"), [(0.0, 0.0), (3.0, 0.0), (-4.2, 0.02), (2.0, -0.03)])
-def test_a_map_tells_how_far_the_start_is_off(offset, share):
+@pytest.mark.parametrize(("offset", "fraction"), [(0.0, 0.0), (3.0, 0.0), (-4.2, 0.02), (2.0, -0.03)])
+def test_a_map_tells_how_far_the_start_is_off(offset, fraction):
     weights = map_filter.init(jax.random.key(0))
     passed = (
-        np.maximum(np.arange(N_METRES) - DELAY + 1.0, 0.0) * share
+        np.maximum(np.arange(N_METRES) - DELAY + 1.0, 0.0) * fraction
     )  # what a perfect localiser says of the metres passed
     beliefs, (found, sigma, believed) = _beliefs(
-        weights, share, 50.0 - offset, 3.0, map_of_walls(first=-50.0), passed.astype(np.float32)
+        weights, fraction, 50.0 - offset, 3.0, map_of_walls(first=-50.0), passed.astype(np.float32)
     )
     assert float(found) == pytest.approx(offset, abs=0.15)
     assert float(sigma) < 0.5
@@ -245,7 +245,7 @@ def test_a_belief_widens_as_the_localiser_says_and_the_truth_is_looked_up_betwee
     two_metres = jnp.zeros(len(map_filter.SHIFTS)).at[map_filter.SIDE + 10].set(1.0)
     fresh = map_filter.MapBelief(two_metres, jnp.zeros(()))
     now = map_filter.advance(weights, fresh, jnp.zeros_like(two_metres), jnp.float32(0.5))
-    assert np.asarray(now.share) @ (map_filter.SHIFTS - 2.0) ** 2 == pytest.approx(0.003 * np.e, rel=1e-3)
+    assert np.asarray(now.fraction) @ (map_filter.SHIFTS - 2.0) ** 2 == pytest.approx(0.003 * np.e, rel=1e-3)
     beside = 0.003 * np.e / map_filter.CELL**2 / 2
     found = [float(map_filter.likelihood(now, jnp.float32(2.05), jnp.asarray(right))) for right in (True, False)]
     between = 0.75 * (1.0 - 2.0 * beside) + 0.25 * beside

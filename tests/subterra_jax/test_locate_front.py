@@ -18,12 +18,12 @@ from subterra_jax.policies.locate.profiles import Points
 from tests.subterra_jax.patches import HALF, N_METRES, drive_past, patches
 
 
-@pytest.mark.parametrize("share", [-0.03, 0.0, 0.02])
-def test_the_untrained_front_end_finds_the_error_of_the_command(share):
-    record = jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype != bool else x, drive_past(share))
+@pytest.mark.parametrize("fraction", [-0.03, 0.0, 0.02])
+def test_the_untrained_front_end_finds_the_error_of_the_command(fraction):
+    record = jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype != bool else x, drive_past(fraction))
     blocks = _metres(record, N_METRES)
     total = np.asarray(blocks.evidence)[DELAY + 10 :].sum(axis=0)
-    assert matching.SHARES[total.argmax()] == pytest.approx(share, abs=0.0045)
+    assert matching.SHARES[total.argmax()] == pytest.approx(fraction, abs=0.0045)
     assert total.max() - total.mean() > 3.0
 
 
@@ -95,16 +95,16 @@ def test_walls_turned_by_a_heading_are_straight_again():
     assert np.mean(points.seen) > 0.9
 
 
-@pytest.mark.parametrize("share", [-0.02, 0.02])
-def test_strips_above_the_level_ring_tell_the_error_of_the_command(share):
+@pytest.mark.parametrize("fraction", [-0.02, 0.02])
+def test_strips_above_the_level_ring_tell_the_error_of_the_command(fraction):
     sensor = make_sensor("spin16x64")
     driven = np.float32(0.2) * np.arange(5 * 30 + 2)
-    images = np.stack([_image((1.0 + share) * d, sensor, 0.25, 9.0) for d in driven])
+    images = np.stack([_image((1.0 + fraction) * d, sensor, 0.25, 9.0) for d in driven])
     points = jax.jit(jax.vmap(lambda image: _sense(image, np.float32(0.0), "spin16x64")))(images)
-    record = streams.Record(jnp.asarray(driven), jnp.asarray((1.0 + share) * driven), points)
+    record = streams.Record(jnp.asarray(driven), jnp.asarray((1.0 + fraction) * driven), points)
     blocks = _metres(record, 30)
     total = np.asarray(blocks.evidence)[DELAY + 8 :].sum(axis=0)
-    assert matching.SHARES[total.argmax()] == pytest.approx(share, abs=0.0045)
+    assert matching.SHARES[total.argmax()] == pytest.approx(fraction, abs=0.0045)
     level = record.replace(points=jax.tree.map(lambda leaf: leaf[:, : 4 * strips.RAYS], points))
     blind = _metres(level, 30)
     assert np.ptp(np.asarray(blind.evidence), axis=1).max() < 0.2, "at the level of the sensor the wall is smooth"

@@ -38,8 +38,8 @@ def listed_corners(found: cells.Cells, block: int, cell: int) -> np.ndarray:
 
 def test_every_point_of_every_triangle_lies_in_a_cell_that_lists_a_triangle_through_it(sorted_bend):
     found, corner = sorted_bend
-    share = np.random.default_rng(0).dirichlet(np.ones(3), len(corner))
-    points = np.einsum("tk,tki->ti", share, corner)
+    fraction = np.random.default_rng(0).dirichlet(np.ones(3), len(corner))
+    points = np.einsum("tk,tki->ti", fraction, corner)
     seen, blocks = np.zeros(len(points), bool), found.blocks
     n_x = len(found.cell) // (len(found.low) * cells.N_WEDGES)
     for k, (centre, turn) in enumerate(zip(blocks.centre, blocks.turn, strict=True)):

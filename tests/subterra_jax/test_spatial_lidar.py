@@ -104,10 +104,10 @@ def test_a_way_in_a_sweep_is_the_arc_that_the_robot_drives():
     for command in ([1.5, 0.35], [2.0, 0.0], [0.0, 1.0], [1.0, 1e-6]):
         motion = jnp.array(command)
         position, heading = follow_arc(fresh.position, fresh.heading, motion, jnp.float32(0.1))
-        share = jnp.linspace(0.0, 1.0, 5)
-        places, headings = along_arc(fresh, position, heading, share)
+        fraction = jnp.linspace(0.0, 1.0, 5)
+        places, headings = along_arc(fresh, position, heading, fraction)
         for k in range(5):
-            place, turned = follow_arc(fresh.position, fresh.heading, motion, 0.1 * share[k])
+            place, turned = follow_arc(fresh.position, fresh.heading, motion, 0.1 * fraction[k])
             np.testing.assert_allclose(places[k], place, atol=2e-6)
             np.testing.assert_allclose(np.cos(headings[k] - turned), 1.0, atol=1e-6)
 
@@ -158,15 +158,15 @@ def test_weak_echoes_are_lost_by_range_incidence_and_material():
     n, uniform = 40_000, jax.random.uniform(jax.random.key(0), (40_000,))
     params = echo.EchoParams(weakest=0.1 / 45.0**2)
 
-    def share(metres, cosine, reflectivity):
+    def fraction(metres, cosine, reflectivity):
         ask = [jnp.full(n, value) for value in (metres, cosine, reflectivity)]
         return float(jnp.mean(echo.returns(*ask, uniform, params)))
 
-    assert share(45.0, 1.0, 0.1) == pytest.approx(0.5 * 0.996, abs=0.01)
-    assert share(5.0, 1.0, 0.3) == pytest.approx(0.996, abs=0.002)
+    assert fraction(45.0, 1.0, 0.1) == pytest.approx(0.5 * 0.996, abs=0.01)
+    assert fraction(5.0, 1.0, 0.3) == pytest.approx(0.996, abs=0.002)
     # One standard deviation of the fading: the echo is e^-0.5 of the weakest.
-    assert share(45.0, np.exp(-0.5), 0.1) == pytest.approx(0.1587, abs=0.01)
-    assert share(45.0, 1.0, 0.2) > share(45.0, 1.0, 0.1) > share(60.0, 1.0, 0.1)
+    assert fraction(45.0, np.exp(-0.5), 0.1) == pytest.approx(0.1587, abs=0.01)
+    assert fraction(45.0, 1.0, 0.2) > fraction(45.0, 1.0, 0.1) > fraction(60.0, 1.0, 0.1)
 
 
 def test_materials_are_told_apart_and_bright_when_met_squarely():

@@ -207,7 +207,7 @@ def score(records: dict[str, np.ndarray], period: float) -> dict[str, float]:
     """Figures of what a `walker` tells.
 
     Returns:
-        `falls` (share of the robots that fell before the episode's end), `velocity_error` (m/s, mean distance in plan
+        `falls` (fraction of robots that fell before the episode's end), `velocity_error` (m/s, mean distance in plan
         between velocity and command), `yaw_rate_error` (rad/s, mean absolute), both averaged over a stride of 0.4 s
         against the slewed command and from 1 s after the start, `contacts` (fraction of robots that touched a wall),
         `power` (W, mean mechanical), and `robots`.

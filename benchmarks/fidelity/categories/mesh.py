@@ -109,8 +109,8 @@ def mesh_nonmanifold_edges(case: Case) -> Value:
 def mesh_duplicate_faces(case: Case) -> Value:
     """Fraction of faces that another face repeats, whichever way round; the worse of lining and solid."""
     both = derived.welded_lining(case), derived.welded_solid(case)
-    shares = [1.0 - len(np.unique(np.sort(mesh.faces, axis=1), axis=0)) / len(mesh.faces) for mesh in both]
-    return number(max(shares), sum(len(mesh.faces) for mesh in both))
+    fractions = [1.0 - len(np.unique(np.sort(mesh.faces, axis=1), axis=0)) / len(mesh.faces) for mesh in both]
+    return number(max(fractions), sum(len(mesh.faces) for mesh in both))
 
 
 @metric("mesh_degenerate_faces", "MSH", D(0, 0.001))

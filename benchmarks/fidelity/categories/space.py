@@ -202,7 +202,7 @@ def free3d_envelope_agree(case: Case) -> Samples:
 
 @metric("free3d_hold_poses_free", "F3D", U(0.95, 0.999999), gate=True, needs="hold", of=mean)
 def free3d_hold_poses_free(case: Case) -> Samples:
-    """Share of the sensor positions between the reference's mouths that are inside and 20 cm clear of any surface."""
+    """Fraction of sensor positions between the reference's mouths that are inside and 20 cm clear of any surface."""
     assert case.hold is not None
     at, curve = case.hold.origin[np.unique(case.hold.scan, return_index=True)[1]], reference_curve(case)
     station = curve.local(at)[:, 0]
@@ -218,8 +218,8 @@ def free3d_voxel_vs_mesh_vol(case: Case) -> Value:
     """Difference between the volume of the voxels inside the lining and that of the solid, %."""
     both, radii = freespace.air_voxels(case), lining_radii(case)
     inside = both.judged | both.blocked
-    share = (both.lattice.shape[0] * both.lattice.edge) / radii.curve.length
-    volume = abs(float(case.candidate.solid.volume)) * min(share, 1.0)
+    fraction = (both.lattice.shape[0] * both.lattice.edge) / radii.curve.length
+    volume = abs(float(case.candidate.solid.volume)) * min(fraction, 1.0)
     voxels = float(inside.sum()) * both.lattice.edge**3
     return number(100.0 * abs(voxels / volume - 1.0), int(inside.sum()))
 

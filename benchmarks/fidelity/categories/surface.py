@@ -150,9 +150,9 @@ def comp_chainage_min(case: Case) -> Value:
     total = station_bins(case, returns(case).local[:, 0])
     bin_count = int(total.max()) + 1
     count = np.bincount(group, minlength=bin_count)
-    share = np.bincount(group, _completeness(case, 0.10), minlength=bin_count) / np.maximum(count, 1)
+    fraction = np.bincount(group, _completeness(case, 0.10), minlength=bin_count) / np.maximum(count, 1)
     judged = np.bincount(total, minlength=bin_count) >= _FEWEST_RETURNS
-    return number(float(share[judged].min()), len(group))
+    return number(float(fraction[judged].min()), len(group))
 
 
 @metric("extra_surface_frac", "CMP", D(6.32e-05, 0.05), gate=True, needs="hold")

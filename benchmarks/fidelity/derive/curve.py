@@ -63,10 +63,10 @@ class Curve:
         along = np.einsum("ij,ij->i", offset, fine["tangent"][nearest])
         station = fine["station"][nearest] + along
         # One more step: the frame turns on the way from the nearest node to the foot of the perpendicular.
-        share = np.clip(np.nan_to_num(along / _FINE), -0.5, 0.5)[:, None]
-        ahead = np.clip(nearest + np.where(share[:, 0] >= 0, 1, -1), 0, len(fine["station"]) - 1)
-        share = np.abs(share)
-        frame = {name: (1.0 - share) * fine[name][nearest] + share * fine[name][ahead] for name in ("left", "up")}
+        fraction = np.clip(np.nan_to_num(along / _FINE), -0.5, 0.5)[:, None]
+        ahead = np.clip(nearest + np.where(fraction[:, 0] >= 0, 1, -1), 0, len(fine["station"]) - 1)
+        fraction = np.abs(fraction)
+        frame = {name: (1.0 - fraction) * fine[name][nearest] + fraction * fine[name][ahead] for name in ("left", "up")}
         inside = np.clip(station, fine["station"][0], fine["station"][-1])
         foot = interpolate_rows(inside, fine["station"], fine["position"])
         away = points - foot
@@ -181,14 +181,14 @@ def point_profile(
 
 
 def grouped_median(
-    group: np.ndarray, values: Float[np.ndarray, " k"], count: int, least: int = 1, share: float = 0.5
+    group: np.ndarray, values: Float[np.ndarray, " k"], count: int, least: int = 1, fraction: float = 0.5
 ) -> Float[np.ndarray, " count"]:
     """Return the median of each group, or another quantile; NaN for a group of fewer than `least` members."""
     order = np.lexsort((values, group))
     size = np.bincount(group, minlength=count)
     start = np.cumsum(size) - size
     known = size >= max(least, 1)
-    place = share * (size[known] - 1)
+    place = fraction * (size[known] - 1)
     ordered = values[order]
     result = np.full(count, np.nan)
     low, high = start[known] + np.floor(place).astype(int), start[known] + np.ceil(place).astype(int)

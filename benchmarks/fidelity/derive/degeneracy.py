@@ -170,8 +170,8 @@ def _axial_information(
     across = _cross(beam[:, None], wall[None])
     across = np.where(np.abs(across) < 1e-12, np.nan, across)
     reach = _cross(offset[None], wall[None]) / across
-    share = _cross(offset[None], beam[:, None]) / across
-    reach = np.where((reach > 0.0) & (share >= 0.0) & (share <= 1.0), reach, np.inf)
+    fraction = _cross(offset[None], beam[:, None]) / across
+    reach = np.where((reach > 0.0) & (fraction >= 0.0) & (fraction <= 1.0), reach, np.inf)
     first = np.argmin(reach, axis=1)
     returned = reach[np.arange(PLANAR_BEAMS), first] < PLANAR_REACH
     return float(np.sum(np.square(_cross(wall[first], tangent) / length[first])[returned]))

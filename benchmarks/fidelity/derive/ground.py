@@ -155,7 +155,7 @@ def cell_steps(height: Float[np.ndarray, "n m"], apart: int = 1) -> Float[np.nda
 # The two grounds to compare: by rays against the truth, by the same beams against a recording.
 
 _ROW_SPREAD = (-2, -1, 0, 1, 2)  # rows whose returns a cell shares: one row has too few, and rails run along
-_GROUND_SHARE = 0.8  # of the returns in a cell lie lower than its ground: a rail fills only a part of it
+_GROUND = 0.8  # of the returns in a cell lie lower than its ground: a rail fills only a part of it
 _GAP_CELLS = 3  # cells without a return that are taken from their neighbours
 _WALL_ABOVE = 0.6  # m above the middle of the ground; a return higher up is of the wall
 _WALL_MARGIN = 0.25  # m before the wall
@@ -212,7 +212,7 @@ def _heights_of_points(
     column, above = np.tile(column, len(_ROW_SPREAD)), np.tile(low[:, 2], len(_ROW_SPREAD))
     kept = (spread >= 0) & (spread < len(station)) & (column >= 0) & (column < len(left))
     flat = spread[kept] * len(left) + column[kept]
-    height = grouped_median(flat, above[kept], len(station) * len(left), share=_GROUND_SHARE).reshape(len(station), -1)
+    height = grouped_median(flat, above[kept], len(station) * len(left), fraction=_GROUND).reshape(len(station), -1)
     wall = np.nanquantile(height, 0.5) + _WALL_ABOVE
     height = np.where(height < wall, height, np.nan)
     away, nearest = distance_transform_edt(np.isnan(height), return_indices=True)

@@ -68,8 +68,8 @@ def map_of_radii(radii: Radii) -> Unrolled:
 def _stretch(coarse: Float[np.ndarray, "c m"], rows: int, step: int, first: float = 0.0) -> Float[np.ndarray, "n m"]:
     place = np.clip((np.arange(rows) - first) / step, 0, len(coarse) - 1)
     below = np.minimum(place.astype(int), max(len(coarse) - 2, 0))
-    share = (place - below)[:, None]
-    return (1 - share) * coarse[below] + share * coarse[np.minimum(below + 1, len(coarse) - 1)]
+    fraction = (place - below)[:, None]
+    return (1 - fraction) * coarse[below] + fraction * coarse[np.minimum(below + 1, len(coarse) - 1)]
 
 
 @per_case

@@ -39,7 +39,7 @@ class Fault:
     # Angle of the part of the section that it is at, from left towards up, rad; kinds that have none ignore it
     side: float = 0.0
 
-    def share(self, station: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    def weight(self, station: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
         """Return 1 along the fault, 0 beyond its ramps, smooth between."""
         if self.start is None:
             return np.ones(len(station))
@@ -110,7 +110,7 @@ class Kind:
     """A kind of fault."""
 
     words: str  # Fault in words
-    unit: str  # Unit of its size: `m`, `rad`, `1` (a share or factor) or `count`
+    unit: str  # Unit of its size: `m`, `rad`, `1` (a fraction or factor) or `count`
     # Function that carries it out; it returns the changed candidate, or the case where references change
     change: Callable[[Site, Fault], Candidate | Case]
     signed: bool = True  # True where it goes both ways

@@ -71,11 +71,11 @@ def scale_scene(candidate: Candidate, factor: float, scratch: Path) -> Candidate
     return copy
 
 
-def drop_scene_faces(candidate: Candidate, share: float, rng: np.random.Generator, scratch: Path) -> Candidate:
+def drop_scene_faces(candidate: Candidate, fraction: float, rng: np.random.Generator, scratch: Path) -> Candidate:
     copy = copy_scene(candidate, scratch, lambda file: file.name.startswith("lining_"))
     for file in sorted((candidate.folder / "meshes").glob("lining_*.obj")):
         mesh = trimesh.load_mesh(file, process=False)
-        without_faces(mesh, rng.random(len(mesh.faces)) < share).export(copy.folder / "meshes" / file.name)
+        without_faces(mesh, rng.random(len(mesh.faces)) < fraction).export(copy.folder / "meshes" / file.name)
     return copy
 
 
@@ -143,7 +143,7 @@ def change_both(candidate: Candidate, change: Callable[[trimesh.Trimesh], trimes
     return replace(candidate, lining=change(candidate.lining), solid=change(candidate.solid))
 
 
-@fault_kind("holes", "share of the faces missing, of the released scene too", signed=False)
+@fault_kind("holes", "fraction of the faces missing, of the released scene too", signed=False)
 def drop_faces(site: Site, fault: Fault) -> Candidate:
     rng = site.rng
     holed = drop_scene_faces(site.candidate, fault.size, rng, site.scratch)
@@ -167,7 +167,7 @@ def cut_hole(site: Site, fault: Fault) -> Candidate:
     return change_both(site.candidate, pierced)
 
 
-@fault_kind("flipped", "share of the faces wound the wrong way", signed=False)
+@fault_kind("flipped", "fraction of the faces wound the wrong way", signed=False)
 def flip_faces(site: Site, fault: Fault) -> Candidate:
     def wrong(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
         turned = site.rng.random(len(mesh.faces)) < fault.size
@@ -176,7 +176,7 @@ def flip_faces(site: Site, fault: Fault) -> Candidate:
     return change_both(site.candidate, wrong)
 
 
-@fault_kind("doubled", "share of the faces that stand twice, with as many slivers", signed=False)
+@fault_kind("doubled", "fraction of the faces that stand twice, with as many slivers", signed=False)
 def double_faces(site: Site, fault: Fault) -> Candidate:
     def worse(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
         pick = site.rng.permutation(len(mesh.faces))[: max(int(fault.size * len(mesh.faces)), 1)]
@@ -226,21 +226,21 @@ def add_vertex_noise(site: Site, fault: Fault) -> Candidate:
     return replace(candidate, lining=lining, solid=solid)
 
 
-@fault_kind("coarse", "share of the faces that smoothing and decimation take", signed=False)
+@fault_kind("coarse", "fraction of the faces that smoothing and decimation take", signed=False)
 def coarsen(site: Site, fault: Fault) -> Candidate:
     """Smooths (Laplace, the more the larger the fraction) and then reduces the number of faces."""
     import pymeshlab
 
-    share = fault.size
+    fraction = fault.size
 
     def smooth(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
         origin = mesh.vertices.mean(axis=0)
         work = pymeshlab.MeshSet()
         work.add_mesh(pymeshlab.Mesh(mesh.vertices - origin, mesh.faces))
         work.meshing_merge_close_vertices(threshold=pymeshlab.PureValue(_SAME))
-        work.apply_coord_laplacian_smoothing(stepsmoothnum=max(int(10 * share), 1), boundary=True)
+        work.apply_coord_laplacian_smoothing(stepsmoothnum=max(int(10 * fraction), 1), boundary=True)
         work.meshing_decimation_quadric_edge_collapse(
-            targetfacenum=int((1.0 - share) * len(mesh.faces)), preserveboundary=True, preservenormal=True
+            targetfacenum=int((1.0 - fraction) * len(mesh.faces)), preserveboundary=True, preservenormal=True
         )
         mesh_made = work.current_mesh()
         return trimesh.Trimesh(mesh_made.vertex_matrix() + origin, mesh_made.face_matrix(), process=False)
@@ -250,7 +250,7 @@ def coarsen(site: Site, fault: Fault) -> Candidate:
 
 # Bodies in the bore, and a mouth that is closed.
 
-EACH = 36.0  # m, the tunnels on which the points of the controls were set: a longer one gets its share
+EACH = 36.0  # m, the tunnels on which the points of the controls were set: a longer one gets its fraction
 _WALL_THICKNESS = 0.3  # m
 _DEBRIS_RADIUS = 0.3  # m
 _PILLAR_SIZE = (0.5, 0.4)  # m along and across the tunnel

@@ -208,6 +208,6 @@ def shuffle_beams(site: Site, fault: Fault) -> Case:
     return _with_beams(site.case, lambda hold: np.lexsort((site.rng.random(len(hold.scan)), hold.scan)))
 
 
-@fault_kind("thinned", "share of the held-out beams missing", signed=False)
+@fault_kind("thinned", "fraction of the held-out beams missing", signed=False)
 def thin_beams(site: Site, fault: Fault) -> Case:
     return _with_beams(site.case, lambda hold: np.flatnonzero(site.rng.random(len(hold.scan)) < 1.0 - fault.size))

@@ -312,7 +312,7 @@ def sum_up(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
         if not len(rung):
             continue
         sizes = np.append(rungs(kind), np.inf)
-        half, most = (float(sizes[np.quantile(rung, share, method="higher")]) for share in (0.5, SHARE))
+        half, most = (float(sizes[np.quantile(rung, fraction, method="higher")]) for fraction in (0.5, SHARE))
         table.append({
             "kind": kind, "words": KINDS[kind].words, "unit": KINDS[kind].unit, "length": asked.length,
             "places": len(rung), "asked": asked.size, "noticed_at_asked": int((rung <= _BELOW).sum()),

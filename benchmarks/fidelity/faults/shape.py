@@ -30,7 +30,7 @@ def bulge(site: kinds.Site, fault: kinds.Fault) -> Candidate:
     def push(local: kinds.Points) -> kinds.Points:
         away = np.abs(np.angle(np.exp(1j * (np.arctan2(local[:, 2], local[:, 1]) - fault.side))))
         near = kinds.smooth_step((_RIM - away) / (_RIM - _CORE))
-        return (fault.size * fault.share(local[:, 0]) * near)[:, None] * way
+        return (fault.size * fault.weight(local[:, 0]) * near)[:, None] * way
 
     return site.moved(push, ("lining", "solid", "nails"))
 
@@ -43,9 +43,9 @@ def raise_floor(site: kinds.Site, fault: kinds.Fault) -> Candidate:
 
     def raised(local: kinds.Points) -> kinds.Points:
         fade = np.interp(local[:, 2] - bottom, _FLOOR_RISE, [1.0, 0.0])
-        return kinds.along(2, fault.size * fault.share(local[:, 0]) * fade)
+        return kinds.along(2, fault.size * fault.weight(local[:, 0]) * fade)
 
-    rise = fault.size * fault.share(bore.station)
+    rise = fault.size * fault.weight(bore.station)
     down = np.where(np.sin(bore.angle) < -0.5, np.sin(bore.angle), 0.0)
     floor = replace(bore, height=bore.height - rise, radius=bore.radius + rise[:, None] * down)
     return replace(site.moved(raised), bore=floor)
@@ -53,7 +53,7 @@ def raise_floor(site: kinds.Site, fault: kinds.Fault) -> Candidate:
 
 def shift(axis: int, parts: tuple[str, ...] = kinds.EVERYTHING) -> Callable[[kinds.Site, kinds.Fault], Candidate]:
     """Return the change that moves parts to the left (axis 1) or up (2)."""
-    return lambda site, fault: site.moved(lambda local: kinds.along(axis, fault.size * fault.share(local[:, 0])), parts)
+    return lambda site, fault: site.moved(lambda at: kinds.along(axis, fault.size * fault.weight(at[:, 0])), parts)
 
 
 kinds.fault_kind("aside", "everything to one side", "m")(shift(1))
@@ -73,7 +73,7 @@ def move_along(site: kinds.Site, fault: kinds.Fault) -> Candidate:
 @kinds.fault_kind("roll", "section turned about its axis", "rad")
 def roll(site: kinds.Site, fault: kinds.Fault) -> Candidate:
     def turned(local: kinds.Points) -> kinds.Points:
-        turn = fault.size * fault.share(local[:, 0])
+        turn = fault.size * fault.weight(local[:, 0])
         left = local[:, 1] * np.cos(turn) - local[:, 2] * np.sin(turn)
         up = local[:, 1] * np.sin(turn) + local[:, 2] * np.cos(turn)
         return np.column_stack([np.zeros(len(local)), left - local[:, 1], up - local[:, 2]])
@@ -98,12 +98,12 @@ def _inside_out(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 def scale(*axes: float) -> Callable[[kinds.Site, kinds.Fault], Candidate]:
     """Return the change that scales every section about its axis: 1 for those of station, left and up that grow."""
     return lambda site, fault: site.moved(
-        lambda local: fault.size * fault.share(local[:, 0])[:, None] * local * list(axes)
+        lambda local: fault.size * fault.weight(local[:, 0])[:, None] * local * list(axes)
     )
 
 
-kinds.fault_kind("section", "sections too large, as a share of width and height")(scale(0.0, 1.0, 1.0))
-kinds.fault_kind("width", "sections too wide, as a share of the width")(scale(0.0, 1.0, 0.0))
+kinds.fault_kind("section", "sections too large, as a fraction of width and height")(scale(0.0, 1.0, 1.0))
+kinds.fault_kind("width", "sections too wide, as a fraction of the width")(scale(0.0, 1.0, 0.0))
 
 
 @kinds.fault_kind("wave", "a sideways wave of 100 m length", "m")
@@ -114,7 +114,7 @@ def add_wave(site: kinds.Site, fault: kinds.Fault) -> Candidate:
 # All of the tunnel, whatever the place of the fault.
 
 
-@kinds.fault_kind("scale", "everything too large, as a share of its size")
+@kinds.fault_kind("scale", "everything too large, as a fraction of its size")
 def scale_all(site: kinds.Site, fault: kinds.Fault) -> Candidate:
     """Scales everything about the middle of the axis, the released scene too."""
     middle, factor = site.candidate.bore.position.mean(axis=0), 1.0 + fault.size
@@ -130,7 +130,7 @@ def turn_yaw(site: kinds.Site, fault: kinds.Fault) -> Candidate:
     return kinds.warp(site.candidate, lambda points: middle + (points - middle) @ turn.T)
 
 
-@kinds.fault_kind("straight", "curvature missing, as a share of it", signed=False)
+@kinds.fault_kind("straight", "curvature missing, as a fraction of it", signed=False)
 def straighten(site: kinds.Site, fault: kinds.Fault) -> Candidate:
     """Moves the axis towards a straight line of the same length and mean direction; 1 leaves no curvature."""
     line = site.line
@@ -142,7 +142,7 @@ def straighten(site: kinds.Site, fault: kinds.Fault) -> Candidate:
     return kinds.warp(site.candidate, lambda points: target.point(line.local(points)))
 
 
-@kinds.fault_kind("stretch", "mesh and recording together too long, as a share of the length")
+@kinds.fault_kind("stretch", "mesh and recording together too long, as a fraction of the length")
 def stretch_axis(site: kinds.Site, fault: kinds.Fault) -> Case:
     """Lengthens reconstruction and recording together, as a drifting odometry does; control stays."""
     case, line, factor = site.case, site.line, 1.0 + fault.size
@@ -156,7 +156,7 @@ def stretch_axis(site: kinds.Site, fault: kinds.Fault) -> Case:
     return replace(case, candidate=kinds.warp(case.candidate, move), hold=hold, fit=fit, cache={})
 
 
-@kinds.fault_kind("short", "last part missing, as a share of the length", signed=False)
+@kinds.fault_kind("short", "last part missing, as a fraction of the length", signed=False)
 def shorten(site: kinds.Site, fault: kinds.Fault) -> Candidate:
     candidate, line = site.candidate, site.line
     bore, track, end = candidate.bore, candidate.track, candidate.length * (1.0 - fault.size)
@@ -203,7 +203,7 @@ def spread_rails(site: kinds.Site, fault: kinds.Fault) -> Candidate:
     middle = float(np.mean(tops))
 
     def shift(local: kinds.Points) -> kinds.Points:
-        return kinds.along(1, 0.5 * fault.size * fault.share(local[:, 0]) * np.sign(local[:, 1] - middle))
+        return kinds.along(1, 0.5 * fault.size * fault.weight(local[:, 0]) * np.sign(local[:, 1] - middle))
 
     return site.moved(shift, kinds.RAILS)
 
@@ -214,7 +214,7 @@ def shift_sleepers(site: kinds.Site, fault: kinds.Fault) -> Candidate:
 
     def shift(middles: np.ndarray) -> np.ndarray:
         station = site.line.local(middles)[:, 0]
-        return fault.size * (fault.share(station) > 0.5)[:, None] * site.line.frames(station)[1]
+        return fault.size * (fault.weight(station) > 0.5)[:, None] * site.line.frames(station)[1]
 
     track, names = site.candidate.track, ("sleeper_mesh", "fastening_mesh")
     meshes: dict[str, Any] = {name: move_bodies(getattr(track, name), shift) for name in names}
@@ -245,12 +245,12 @@ def respace_sleepers(site: kinds.Site, fault: kinds.Fault) -> Candidate:
     ))  # fmt: skip
 
 
-@kinds.fault_kind("missing", "share of the sleepers missing", signed=False)
+@kinds.fault_kind("missing", "fraction of the sleepers missing", signed=False)
 def drop_sleepers(site: kinds.Site, fault: kinds.Fault) -> Candidate:
     """Removes a fraction of the sleepers along the fault, evenly spread, with their fastenings."""
     track, line = site.candidate.track, site.line
     station = line.local(track.sleeper)[:, 0]
-    inside = np.flatnonzero(fault.share(station) > 0.5)
+    inside = np.flatnonzero(fault.weight(station) > 0.5)
     gone = inside[np.floor(np.arange(1, len(inside) + 1) * fault.size) > np.floor(np.arange(len(inside)) * fault.size)]
 
     def stays(middles: np.ndarray) -> np.ndarray:
@@ -262,13 +262,13 @@ def drop_sleepers(site: kinds.Site, fault: kinds.Fault) -> Candidate:
     ))  # fmt: skip
 
 
-@kinds.fault_kind("pockets", "share of the pockets' depth filled; below 0 they are too deep")
+@kinds.fault_kind("pockets", "fraction of the pockets' depth filled; below 0 they are too deep")
 def fill_pockets(site: kinds.Site, fault: kinds.Fault) -> Candidate:
     """Takes a fraction of their depth from the pockets along the fault; 1 closes them and removes the nails in them."""
     candidate, bore, line, factor = site.candidate, site.candidate.bore, site.line, 1.0 - fault.size
     if not len(bore.pocket):
         return candidate
-    chosen = fault.share(bore.pocket["station"]) > 0.5
+    chosen = fault.weight(bore.pocket["station"]) > 0.5
     pockets = bore.pocket[chosen]
 
     def changed(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
@@ -315,11 +315,11 @@ def _smooth_radius(candidate: Candidate, station: np.ndarray, angle: np.ndarray)
     bore = candidate.bore
     row = np.clip(np.searchsorted(bore.station, station), 1, len(bore.station) - 1)
     step = (angle - bore.angle[0]) / (bore.angle[1] - bore.angle[0])
-    low, share = np.floor(step).astype(int) % len(bore.angle), step - np.floor(step)
+    low, fraction = np.floor(step).astype(int) % len(bore.angle), step - np.floor(step)
     ahead = (station - bore.station[row - 1]) / (bore.station[row] - bore.station[row - 1])
     ahead = np.clip(ahead, 0.0, 1.0)
     high = (low + 1) % len(bore.angle)
-    before, after = (bore.radius[r, low] * (1 - share) + bore.radius[r, high] * share for r in (row - 1, row))
+    before, after = (bore.radius[r, low] * (1 - fraction) + bore.radius[r, high] * fraction for r in (row - 1, row))
     return (1 - ahead) * before + ahead * after
 
 

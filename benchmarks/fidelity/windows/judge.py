@@ -155,7 +155,7 @@ MEASURES = tuple(Measure(*row) for row in (
     ("sector", "mean offset of one part of the section", "m", 0.08, _by_cells(_worst_sector)),
     ("aside", "section moved to one side", "m", 0.05, _by_cells(_moved(np.cos(_ANGLE)))),
     ("lift", "section moved up or down", "m", 0.05, _by_cells(_moved(np.sin(_ANGLE)))),
-    ("cells", f"share of the surface more than {100 * OFF_CELL:g} cm off", "1", 0.2,
+    ("cells", f"fraction of the surface more than {100 * OFF_CELL:g} cm off", "1", 0.2,
      _by_cells(lambda cells: (float(np.mean(np.abs(cells[np.isfinite(cells)]) > OFF_CELL)), ""))),
     ("spot", f"one spot of {deviation.CELL:g} m by {360 // deviation.SECTORS:d} degrees", "m", 0.3,
      _by_cells(_worst_spot)),

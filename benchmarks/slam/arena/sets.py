@@ -126,10 +126,10 @@ def _record(config: ArenaConfig, course: Course) -> str:
     scene = draw_scene(course, course_seed(config, course))
     total, shown = scene.drive.duration, -1
     for message in write_recording(scene, part, config.formats):
-        share = int(10.0 * 1e-9 * message.time / total)
-        if share > shown and sys.stderr.isatty():
-            shown = share
-            print(f"{course.name}: {10 * share} %", end="\r", file=sys.stderr)
+        fraction = int(10.0 * 1e-9 * message.time / total)
+        if fraction > shown and sys.stderr.isatty():
+            shown = fraction
+            print(f"{course.name}: {10 * fraction} %", end="\r", file=sys.stderr)
     write_truth(scene, config.out / TRUTH / course.name)
     (config.out / RECORDINGS).mkdir(exist_ok=True)
     part.rename(config.out / RECORDINGS / course.name)

@@ -87,8 +87,8 @@ def _attend(layer: Weights, q: Array, k: Array, v: Array, there: Array) -> Array
     """Returns the mean of the values of the last rows, by head, weighted by how their keys fit the query."""
     split = lambda x: x.reshape(*x.shape[:-1], _HEADS, -1)  # noqa: E731
     score = jnp.einsum("hd,shd->hs", split(q), split(k)) / np.sqrt(HIDDEN / _HEADS) + layer["near"]
-    share = jax.nn.softmax(jnp.where(there, score, -1e9), axis=-1)
-    return jnp.einsum("hs,shd->hd", share, split(v)).reshape(-1)
+    fraction = jax.nn.softmax(jnp.where(there, score, -1e9), axis=-1)
+    return jnp.einsum("hs,shd->hd", fraction, split(v)).reshape(-1)
 
 
 def _mix(layer: Weights, x: Array, heard: Array) -> Array:

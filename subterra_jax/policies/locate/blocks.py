@@ -23,16 +23,16 @@ class Estimate:
     """Answer of a memory."""
 
     correction: Float[Array, ""]  # true less commanded distance since the start, m
-    share: Float[Array, ""]  # the same for the metres to come, m per m
+    fraction: Float[Array, ""]  # the same for the metres to come, m per m
     log_scale: Float[Array, ""]  # log of the mean absolute error of `correction` that is expected, m
 
 
-def matched_inputs(block: Block, shares: Float[Array, "n_shares"]) -> Float[Array, "n"]:
+def matched_inputs(block: Block, fractions: Float[Array, "n_shares"]) -> Float[Array, "n"]:
     """Returns evidence over the errors `shares`, and odometry, as inputs of a network."""
     centred = block.evidence - jnp.mean(block.evidence, axis=-1, keepdims=True)
     belief = jnp.exp(block.evidence - jnp.max(block.evidence, axis=-1, keepdims=True))
     belief = belief / jnp.sum(belief, axis=-1, keepdims=True)
-    mean = jnp.sum(belief * shares, axis=-1, keepdims=True)
-    sigma = jnp.sqrt(jnp.sum(belief * (shares - mean) ** 2, axis=-1, keepdims=True) + 1e-10)
+    mean = jnp.sum(belief * fractions, axis=-1, keepdims=True)
+    sigma = jnp.sqrt(jnp.sum(belief * (fractions - mean) ** 2, axis=-1, keepdims=True) + 1e-10)
     read, steps = block.read[..., None], jnp.minimum(block.steps[..., None], _SLOWEST)
     return jnp.concatenate([0.3 * centred, 30.0 * mean, 30.0 * sigma, 20.0 * read, 0.1 * steps], axis=-1)

@@ -89,7 +89,7 @@ class Locator(Localiser):
         )
         now = jax.tree.map(lambda new, old: jnp.where(ended, new, old), after, now)
         since = at - now.metres
-        station = now.begin + at + now.estimate.correction + now.estimate.share * since
+        station = now.begin + at + now.estimate.correction + now.estimate.fraction * since
         log_sigma = now.estimate.log_scale + jnp.log(_TO_SIGMA)
         return Station(station, jnp.maximum(log_sigma, jnp.log(0.01)), driven.direction), now
 
@@ -119,9 +119,9 @@ class Locator(Localiser):
         window = profiles.forget(before.window, _newest(before.driven), _newest(now.driven))
         window = profiles.add_points(window, points, (now.driven + points.along) / BIN, wrapped=True)
         metre = before.metres
-        share = (metre + 1.0 - before.driven) / jnp.maximum(now.driven - before.driven, 1e-6)
-        read = before.reading + share * (now.reading - before.reading)
-        steps = before.steps + share
+        fraction = (metre + 1.0 - before.driven) / jnp.maximum(now.driven - before.driven, 1e-6)
+        read = before.reading + fraction * (now.reading - before.reading)
+        steps = before.steps + fraction
         match = self.weights["match"]
         if self.blind:
             evidence = jnp.zeros_like(match["shares"])

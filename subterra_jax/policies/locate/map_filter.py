@@ -47,7 +47,7 @@ _TO_MEAN_ABSOLUTE = float(np.sqrt(2.0 / np.pi))
 class MapBelief:
     """Memory of the filter."""
 
-    share: Float[Array, "n_shifts"]  # probability of each of `SHIFTS`, if the map is of this tunnel
+    fraction: Float[Array, "n_shifts"]  # probability of each of `SHIFTS`, if the map is of this tunnel
     log_odds: Float[Array, ""]  # log odds that it is
 
 
@@ -148,8 +148,8 @@ def agreement(
     n = N_REACH - 2 * SLACK
     cut = lambda row, first: jax.lax.dynamic_slice_in_dim(row, first, n + 1)  # noqa: E731
     rows = jax.vmap(jax.vmap(cut))(mapped, SLACK + lower.astype(jnp.int32))
-    share = (moved - lower)[..., None, None]
-    rows = (1.0 - share) * rows[:, :, :-1] + share * rows[:, :, 1:]
+    fraction = (moved - lower)[..., None, None]
+    rows = (1.0 - fraction) * rows[:, :, :-1] + fraction * rows[:, :, 1:]
     counts = jax.nn.softplus(weights["pair"])[:, None]
     there = jnp.any(seen != 0.0, axis=-1, keepdims=True)
     left = jnp.concatenate([2.0 * counts * seen, -counts * there], axis=-1)
@@ -172,12 +172,12 @@ def advance(weights: Weights, now: MapBelief, ratio: Float[Array, "n_shifts"], l
     """
     variance = jnp.exp(weights["log_widen"] + 2.0 * weights["widen_by"] * log_rate) / CELL**2
     variance = jnp.clip(variance, 1e-3, 0.9)
-    wide = jnp.pad(now.share, 1, mode="edge")
-    share = (1.0 - variance) * now.share + 0.5 * variance * (wide[:-2] + wide[2:])
+    wide = jnp.pad(now.fraction, 1, mode="edge")
+    fraction = (1.0 - variance) * now.fraction + 0.5 * variance * (wide[:-2] + wide[2:])
     leak = jax.nn.sigmoid(weights["leak"])
-    share = (1.0 - leak) * share / jnp.sum(share) + leak / len(SHIFTS)
+    fraction = (1.0 - leak) * fraction / jnp.sum(fraction) + leak / len(SHIFTS)
     top = jnp.max(ratio)
-    weighed = share * jnp.exp(ratio - top)
+    weighed = fraction * jnp.exp(ratio - top)
     total = jnp.sum(weighed)
     log_odds = jnp.clip(now.log_odds + top + jnp.log(total), -_MOST, _MOST)
     return MapBelief(weighed / total, log_odds)
@@ -187,21 +187,21 @@ def likelihood(now: MapBelief, shift: Float[Array, ""], right: Bool[Array, ""]) 
     """Returns the log probability of the truth: shift (m) and map if it is the right one, else that it is not."""
     place = jnp.clip(shift / CELL + SIDE, 0.0, 2.0 * SIDE - 1e-3)
     lower = jnp.floor(place).astype(jnp.int32)
-    share = place - lower
-    there = (1.0 - share) * now.share[lower] + share * now.share[lower + 1]
+    fraction = place - lower
+    there = (1.0 - fraction) * now.fraction[lower] + fraction * now.fraction[lower + 1]
     mine = jax.nn.log_sigmoid(now.log_odds) + jnp.log(there + _FLOOR)
     return jnp.where(right, mine, jax.nn.log_sigmoid(-now.log_odds))
 
 
 def place(now: MapBelief) -> tuple[Float[Array, ""], Float[Array, ""], Bool[Array, ""]]:
     """Returns the likeliest place of some cells, m, the standard deviation of all about it, and whether to believe."""
-    wide = jnp.pad(now.share, _WINDOW)
+    wide = jnp.pad(now.fraction, _WINDOW)
     n = len(SHIFTS)
     mass = sum(wide[k : k + n] for k in range(2 * _WINDOW + 1))
     best = jnp.argmax(mass)
-    near = jnp.where(jnp.abs(jnp.arange(n) - best) <= _WINDOW, now.share, 0.0)
+    near = jnp.where(jnp.abs(jnp.arange(n) - best) <= _WINDOW, now.fraction, 0.0)
     shift = jnp.sum(near * jnp.asarray(SHIFTS)) / jnp.sum(near)
-    sigma = jnp.sqrt(jnp.sum(now.share * (jnp.asarray(SHIFTS) - shift) ** 2))
+    sigma = jnp.sqrt(jnp.sum(now.fraction * (jnp.asarray(SHIFTS) - shift) ** 2))
     return shift, sigma, now.log_odds > 0.0
 
 
@@ -220,7 +220,7 @@ def corrected(now: MapBelief, plain: Estimate, age: Float[Array, ""], start_sigm
     mapped = 0.5 * jnp.log(jnp.exp(2.0 * since) + (_TO_MEAN_ABSOLUTE * sigma) ** 2)
     unmapped = 0.5 * jnp.log(jnp.exp(2.0 * plain.log_scale) + (_TO_MEAN_ABSOLUTE * start_sigma) ** 2)
     return Estimate(
-        plain.correction + jnp.where(believed, shift, 0.0), plain.share, jnp.where(believed, mapped, unmapped)
+        plain.correction + jnp.where(believed, shift, 0.0), plain.fraction, jnp.where(believed, mapped, unmapped)
     )
 
 

@@ -42,9 +42,9 @@ class MapStrip:
         """
         place = start / BIN - 0.5 + jnp.arange(n, dtype=jnp.float32)
         lower = jnp.floor(place)
-        index, share = lower.astype(jnp.int32), place - lower
+        index, fraction = lower.astype(jnp.int32), place - lower
         cell = self.first_bin + jnp.clip(index, 0, self.n_bins - 2)
-        wall = self.wall[:, cell] + share * (self.wall[:, cell + 1] - self.wall[:, cell])
+        wall = self.wall[:, cell] + fraction * (self.wall[:, cell + 1] - self.wall[:, cell])
         return wall, (index >= 0) & (index < self.n_bins - 1)
 
 

@@ -66,7 +66,7 @@ def _in_middle(taps: list[float]) -> Float[Array, "tap"]:
     return jnp.pad(jnp.array(taps), (_TAPS - len(taps)) // 2)
 
 
-def shares(weights: Weights) -> Float[Array, "n_shares"]:
+def fractions(weights: Weights) -> Float[Array, "n_shares"]:
     """Returns the errors of the command that are compared."""
     return jax.lax.stop_gradient(weights["shares"])
 
@@ -140,7 +140,7 @@ def compare(
     cost = ((ahead_square + behind_square - 2.0 * product) / (count + 1.0))[:, a, b]
     cost = jnp.sum(jax.nn.softplus(weights["pair"])[:, None] * cost, axis=-1)
     apart = (along[:, a] - along[:, b]) / BIN
-    error = shares(weights)
+    error = fractions(weights)
     target = LAGS + jnp.clip(apart[..., None] * error / (1.0 + error), 2.0 - LAGS, LAGS - 2.0)
     curve = _einsum("spek,spk->spe", _cubic(jnp.arange(2 * LAGS + 1) - target[..., None]), cost)
     present = jnp.max(count[..., 0][:, a, b], axis=-1) / BLOCK

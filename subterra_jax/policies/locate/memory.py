@@ -52,7 +52,7 @@ def front_of(tensors: Any) -> str:
 
 def passed(estimate: Estimate, age: Array) -> Array:
     """Returns the part of a network's correction that is of metres which all beams have passed, m."""
-    return estimate.correction - jnp.minimum(age, DELAY) * estimate.share
+    return estimate.correction - jnp.minimum(age, DELAY) * estimate.fraction
 
 
 def log_rate(estimate: Estimate, age: Array) -> Array:
@@ -85,7 +85,7 @@ def sequence(weights: Weights, blocks: Block) -> Estimate:
 
 
 def _embed(weights: Weights, block: Block) -> Array:
-    rows = matched_inputs(block, matching.shares(weights["match"]))
+    rows = matched_inputs(block, matching.fractions(weights["match"]))
     return apply(weights["in_2"], jax.nn.gelu(apply(weights["in"], rows)))
 
 

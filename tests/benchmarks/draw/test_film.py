@@ -45,8 +45,8 @@ def test_beams_end_at_the_walls_that_are_drawn(episode):
     lines = film.wall_lines(drawn)
     start, end = (np.concatenate([line[part] for line in lines]) for part in (slice(None, -1), slice(1, None)))
     along = end - start
-    share = np.einsum("psj,sj->ps", ends[:, None] - start, along) / np.maximum(np.sum(along**2, axis=1), 1e-12)
-    gap = np.linalg.norm(ends[:, None] - start - np.clip(share, 0.0, 1.0)[..., None] * along, axis=-1).min(axis=1)
+    fraction = np.einsum("psj,sj->ps", ends[:, None] - start, along) / np.maximum(np.sum(along**2, axis=1), 1e-12)
+    gap = np.linalg.norm(ends[:, None] - start - np.clip(fraction, 0.0, 1.0)[..., None] * along, axis=-1).min(axis=1)
     assert gap.max() < 0.25
 
 

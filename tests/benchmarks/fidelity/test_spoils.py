@@ -148,10 +148,10 @@ def test_a_hole_has_its_area(base: Case) -> None:
 
 def test_sleepers_go_with_their_fastenings(base: Case) -> None:
     before, after = base.candidate.track, candidate(base, "N22", 30).track
-    share = len(after.sleeper) / len(before.sleeper)
-    assert share == pytest.approx(0.7, abs=0.04)
-    assert len(after.fastening_mesh.faces) / len(before.fastening_mesh.faces) == pytest.approx(share, abs=1e-9)
-    assert len(after.sleeper_mesh.faces) / len(before.sleeper_mesh.faces) == pytest.approx(share, abs=1e-9)
+    fraction = len(after.sleeper) / len(before.sleeper)
+    assert fraction == pytest.approx(0.7, abs=0.04)
+    assert len(after.fastening_mesh.faces) / len(before.fastening_mesh.faces) == pytest.approx(fraction, abs=1e-9)
+    assert len(after.sleeper_mesh.faces) / len(before.sleeper_mesh.faces) == pytest.approx(fraction, abs=1e-9)
 
 
 def test_removed_pockets_leave_a_smooth_wall_of_less_volume(base: Case) -> None:

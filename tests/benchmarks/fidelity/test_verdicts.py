@@ -24,14 +24,14 @@ Values = dict[str, Value]
 
 
 def values(quality: float, worse: tuple[str, ...] = (), much: float = 0.0) -> Values:
-    """Every metric at a share of the way from its bad end to its good one; some categories at another."""
+    """Every metric at a fraction of the way from its bad end to its good one; some categories at another."""
     made = {}
     for id, row in table.load().items():
-        share = much if row.category in worse else quality
-        distance = row.map.bad + share * (row.map.good - row.map.bad)
+        fraction = much if row.category in worse else quality
+        distance = row.map.bad + fraction * (row.map.good - row.map.bad)
         made[id] = Value(distance + (row.map.target if row.map.kind == "B" else 0.0))
         if row.map.kind == "P":
-            made[id] = Value(float(share > 0.5))
+            made[id] = Value(float(fraction > 0.5))
     return made
 
 
@@ -105,9 +105,9 @@ def test_growing_doses_give_a_rank_correlation_of_minus_one() -> None:
     assert rows[0]["spearman"] == pytest.approx(-1.0)
 
 
-@pytest.mark.parametrize("share", [0.965, 0.995])  # by 1.5 points down or up; the global figure moves by less than 0.1
-def test_an_invariance_that_moves_a_category_is_loud(share: float) -> None:
-    rows = judge_outcomes([outcome("I1", 0, values(0.98)), outcome("I4", 0, values(0.98, ("LIN",), share))], base())
+@pytest.mark.parametrize("fraction", [0.965, 0.995])  # by 1.5 points down or up; the global figure moves less
+def test_an_invariance_that_moves_a_category_is_loud(fraction: float) -> None:
+    rows = judge_outcomes([outcome("I1", 0, values(0.98)), outcome("I4", 0, values(0.98, ("LIN",), fraction))], base())
     assert judge.loud(rows) == ["I4"]
 
 

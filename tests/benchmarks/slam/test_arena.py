@@ -227,7 +227,7 @@ def test_dust_hides_walls_and_stands_still_before_the_sensor():
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     far = Hits(np.full(len(ray), 9.0, np.float32), np.ones(len(ray), np.float32), np.zeros(len(ray), np.uint8),
                np.zeros((len(ray), 3), np.float32))  # fmt: skip
-    shares = []
+    fractions = []
     for density in (0.1, 1.0):
         dust = record.draw_dust(np.random.default_rng(1), density)
         once, again = (dust(np.random.default_rng(k), ray, far).distance for k in (2, 3))
@@ -235,9 +235,9 @@ def test_dust_hides_walls_and_stands_still_before_the_sensor():
         assert once.min() > 0.3
         both = (once < 9.0) & (again < 9.0)
         assert np.median(np.abs(once - again)[both]) < 0.5
-        shares.append((once < 9.0).mean())
-    assert shares[1] > shares[0] > 0.05
-    assert shares[1] > 0.4
+        fractions.append((once < 9.0).mean())
+    assert fractions[1] > fractions[0] > 0.05
+    assert fractions[1] > 0.4
 
 
 def test_walls_differ_by_walls_alone():

@@ -36,9 +36,9 @@ def test_goals_lie_anywhere_in_their_range_from_the_start_and_starts_anywhere_in
     assert low - 1e-3 <= way.min() < low + 0.01 * (high - low)
     assert high - 0.01 * (high - low) < way.max() <= high + 0.1
     robots.assert_mean(way, 0.5 * (low + high))
-    share = np.histogram(way, 10, (low - 1e-3, high + 0.1))[0] / len(way)
-    assert np.abs(share - 0.1).max() < 4.0 * np.sqrt(0.1 * 0.9 / len(way))
-    # The share of the room in front of the start is uniform from 0 to 1, whatever the way.
+    fraction = np.histogram(way, 10, (low - 1e-3, high + 0.1))[0] / len(way)
+    assert np.abs(fraction - 0.1).max() < 4.0 * np.sqrt(0.1 * 0.9 / len(way))
+    # The fraction of the room in front of the start is uniform from 0 to 1, whatever the way.
     room = LENGTH - 2.0 * MARGIN - way
     before = (start - MARGIN)[room > 5.0] / room[room > 5.0]
     assert before.min() > -0.01
