@@ -61,7 +61,7 @@ _ODDS: dict[str, dict[Any, int]] = {  # of each value of a convention
     "bad_times": {0.0: 4, 0.001: 1, 0.01: 1, 0.03: 1, 0.1: 1},
     "by_ring": {False: 1, True: 1},
     "empty": {"left out": 2, "zero": 1, "nan": 1},
-    "pieces": {1: 7, 2: 1},
+    "chunks": {1: 7, 2: 1},
     "missing": {0.0: 3, 0.02: 1},
     "big_endian": {False: 3, True: 1},
     "container": {"bag": 2, "mcap": 1, "db3": 1},
@@ -324,7 +324,7 @@ def properties(row: Row) -> Iterator[str]:
     yield f"{row.case.beside} {'with another clock' if row.case.late else 'with the same clock'}"
     yield row.case.sensor
     flags = {
-        "split": convention.bags > 1, "ROS 2": convention.container != "bag", "pieces": convention.pieces > 1,
+        "split": convention.bags > 1, "ROS 2": convention.container != "bag", "pieces": convention.chunks > 1,
         "empty beams kept": convention.empty != "left out", "messages missing": convention.missing > 0.0,
         f"bad times {'above' if convention.bad_times > _MOST_BAD else 'below'} 5 %": convention.bad_times > 0.0,
     }  # fmt: skip

@@ -18,7 +18,7 @@ from scene.poses.imu import IMU_TYPE, imu_samples, imu_topics
 from scene.reading.recording import Recording
 from scene.survey import messages
 from scene.survey.lidar import Lidar, Sweep
-from scene.survey.messages import Convention, Recorder, encode, pieces_of
+from scene.survey.messages import Convention, Recorder, chunks_of, encode
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def _sweeps(recording: Recording, convention: Convention) -> Iterator[_Row]:
         offset, none = np.rint(1e9 * scan.times).astype(np.int64), np.zeros(len(scan.points), np.uint8)
         lidar = Lidar("lidar", offset, 0, none, lambda *_: np.zeros((0, 3)), 0.0, np.inf, 0.0, 0.0)
         sweep = Sweep(number, _since(scan.stamp), offset, none == 0, scan.points, none, none > 0)
-        raws = [encode(*piece, convention) for piece in pieces_of(sweep, lidar, convention)]
+        raws = [encode(*chunk, convention) for chunk in chunks_of(sweep, lidar, convention)]
         yield sweep.begin + int(offset.max(initial=0)), recording.topic, number, raws
 
 

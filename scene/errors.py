@@ -53,7 +53,7 @@ class Code(StrEnum):
     CUT_SHORT = "cut_short"  # The lining goes on behind an end
     PLACE = "place"  # Unexplained returns in one place
     UNEXPLAINED = "unexplained"  # Too many returns far from the model
-    UNSEEN = "unseen"  # A piece of wall without returns
+    UNSEEN = "unseen"  # A patch of wall without returns
     # Lining and track
     BY_STANDARD = "by_standard"  # Rings and pockets that nobody saw
     RAILS = "rails"  # No rails were seen, but they may be there

@@ -41,7 +41,7 @@ FLAG_REACH = 2.0  # m; T2
 TRAVEL_MAX = 120.0  # m; default of the params, which T5 alone reads and sets
 RELOCALISE_MARGIN, RELOCALISE_TRAVEL = 95.0, 60.0  # m; T5
 
-# Short variants, for laptops: a piece of the tunnel in T0, near goals in T1.
+# Short variants, for laptops: a stretch of the tunnel in T0, near goals in T1.
 SHORT_LENGTH = 60.0  # m
 SHORT_GOAL_LOW, SHORT_GOAL_HIGH, SHORT_TOLERANCE = 10.0, 60.0, 0.25  # m
 

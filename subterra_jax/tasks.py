@@ -61,8 +61,8 @@ class Task:
 
     rule: Rule  # rule of the task
     horizon: int  # steps after which an episode is truncated
-    # start and length of the piece of tunnel that the task happens in, m; None for the whole tunnel
-    piece: tuple[float, float] | None = None
+    # start and length of the stretch of tunnel that the task happens in, m; None for the whole tunnel
+    stretch: tuple[float, float] | None = None
     parts: tuple[Part, ...] = PLAIN  # sensors, errors and obstacles, in the order in which they act
     # entries of `EnvParams` that differ from the defaults of parts and rule
     params: Mapping[str, Any] = dataclasses.field(default_factory=dict)
@@ -101,7 +101,7 @@ def register(
     *,
     like: str | None = None,
     horizon: int | None = None,
-    piece: tuple[float, float] | None = None,
+    stretch: tuple[float, float] | None = None,
     parts: Sequence[Part] | None = None,
     params: Mapping[str, Any] | None = None,
     tunnel: str | None = None,
@@ -113,7 +113,7 @@ def register(
         rule: Rule of the task.
         like: Id of a task that has what is not given here.
         horizon: Steps after which an episode is truncated; needed without `like`.
-        piece: Start and length of the piece of tunnel that the task happens in, m; None for the whole tunnel.
+        stretch: Start and length of the stretch of tunnel that the task happens in, m; None for the whole tunnel.
         parts: Parts in the order in which they act: `PLAIN` (the default), `SLIPPING`, or parts of one's own.
         params: Entries of `EnvParams` that differ from the defaults of parts and rule, or from those of `like`.
         tunnel: Tunnel where none is named, as `subterra-351`; None for some of the open world.
@@ -136,7 +136,7 @@ def register(
     if horizon is None and like is None:
         raise ValueError(f"{id}: say horizon=STEPS, or like=ID of a task that has one")
     base = Task(rule, 0) if like is None else TASKS[find(like)]
-    named = {"horizon": horizon, "piece": piece, "parts": None if parts is None else tuple(parts), "tunnel": tunnel}
+    named = {"horizon": horizon, "stretch": stretch, "parts": None if parts is None else tuple(parts), "tunnel": tunnel}
     given: dict[str, Any] = {name: value for name, value in named.items() if value is not None}
     TASKS[id] = dataclasses.replace(base, rule=rule, params={**base.params, **(params or {})}, **given)
     if importlib.util.find_spec("gymnasium") is not None:
@@ -186,9 +186,9 @@ def make(
         id: A key of `TASKS`; `MODULE:ID` or `FILE.py:ID` for a task of one's own; or `Subterra/B2Walk-v1` or
             `Subterra/B2Traverse-v1`, whose further arguments `subterra_jax.b2.tasks.make` and `on_legs` say.
         tunnel: A tunnel file, a name as for `load_tunnel`, a plan from it, a list of such, of which each episode draws
-            one, or a ready `Tunnel`, one or several, which is taken as it is, neither cut to the task's piece nor given
-            another lining. None is `open:train:0-11`, twelve tunnels of the open world of which each episode draws
-            one (with a LiDAR in three dimensions the shortest of each kind among the first hundred); `subterra-351` for
+            one, or a ready `Tunnel`, one or several, which is taken as it is, neither cut to the task's stretch nor
+            given another lining. None is `open:train:0-11`, twelve tunnels of the open world, one of them an episode
+            (with a LiDAR in three dimensions the shortest of each kind among the first hundred); `subterra-351` for
             the paper's task and the B2's.
         lining: Variant of the walls: `pockets` (as in the recorded bore), `smooth` or `furnished`. None is `pockets`,
             or the first where a tunnel has none.
@@ -265,14 +265,14 @@ def make(
     if motion == ROVER:
         from subterra_jax.physics import rolling  # MuJoCo is loaded only where physics is meant
 
-        env, entries = rolling.on_rover(env, tunnel, lining, task.piece, {**task.params, **overrides}, hidden_start)
+        env, entries = rolling.on_rover(env, tunnel, lining, task.stretch, {**task.params, **overrides}, hidden_start)
     elif id in MISSIONS:
         env, entries = walking.on_legs(env, tunnel, lining, overrides)
     else:
         entries = collect_entries(env, {**task.params, **overrides})
     check_robot(entries)
     reach = c.RANGE_MAX if spatial else float(np.max(entries["lidar"].range_max))
-    placed = resolve(tunnel, lining, task.piece, reach, spatial)
+    placed = resolve(tunnel, lining, task.stretch, reach, spatial)
     if entries["lidar"].texture is not None and np.any(np.asarray(placed.texture) < 0):
         raise TunnelError(f"{tunnel}: has no field 'texture', the seed of its walls' brightness: use texture=0")
     params = make_params(env, placed, horizon, entries)

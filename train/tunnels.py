@@ -33,7 +33,7 @@ def load(
     names: Sequence[str | Path | None],
     lining: str | None = None,
     sensor: str = PLANAR,
-    piece: tuple[float, float] | None = None,
+    stretch: tuple[float, float] | None = None,
 ) -> list[Tunnel]:
     """Returns the tunnels of these names.
 
@@ -41,12 +41,12 @@ def load(
         names: Names or files of single tunnels; None is the packaged one.
         lining: Variant of the walls; None is the usual one.
         sensor: The LiDAR; one in three dimensions needs the bore.
-        piece: Start and length of the piece to cut out of each, m; None keeps the whole.
+        stretch: Start and length of the stretch to cut out of each, m; None keeps the whole.
 
     Raises:
         TunnelError: There is no such tunnel or lining.
     """
-    one = functools.partial(_tunnel, lining=lining, piece=piece, spatial=sensor != PLANAR)
+    one = functools.partial(_tunnel, lining=lining, stretch=stretch, spatial=sensor != PLANAR)
     return in_processes(one, list(names), _EACH if sensor == PLANAR else 1)
 
 
@@ -60,9 +60,9 @@ def in_processes(work: Callable[[Any], Any], items: list[Any], each: int) -> lis
         return list(pool.map(work, items, chunksize=1))
 
 
-def _tunnel(name: str | Path | None, lining: str | None, piece: tuple[float, float] | None, spatial: bool) -> Tunnel:
+def _tunnel(name: str | Path | None, lining: str | None, stretch: tuple[float, float] | None, spatial: bool) -> Tunnel:
     """Returns a tunnel whose arrays are of the host, so that they go from one process to another."""
-    return jax.device_get(resolve(name, lining, piece, constants.RANGE_MAX, spatial))
+    return jax.device_get(resolve(name, lining, stretch, constants.RANGE_MAX, spatial))
 
 
 def _on_cpu() -> None:

@@ -161,7 +161,7 @@ def _open(task: str, tunnel: Path | str | None, lining: str | None, sensor: str,
     given: Any = names if several else names[0]
     try:
         if several and sensor != PLANAR:
-            given = tunnels.load(names, lining, sensor, st.TASKS[task].piece)
+            given = tunnels.load(names, lining, sensor, st.TASKS[task].stretch)
         env, params = st.make(task, given, lining, sensor=sensor, **chosen)
     except st.SubterraError:
         raise

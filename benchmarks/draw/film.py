@@ -87,17 +87,18 @@ def drive_episode(config: FilmConfig) -> tuple[Drawn, float, View | None]:
     env, params = world.env, world.params
     agent = policies.open_agent(config.agent, env, params)
     drawn = draw(env, params, world.plan, drive(env, params, agent, config.seed, steps=config.steps))
-    view = None if world.track is None else _view(config, env, params, drawn, TASKS[id].piece if id in TASKS else None)
+    cut = TASKS[id].stretch if id in TASKS else None
+    view = None if world.track is None else _view(config, env, params, drawn, cut)
     return drawn, float(params.vehicle.radius), view
 
 
-def _view(config: FilmConfig, env: Any, params: Any, drawn: Drawn, piece: Any) -> View | None:
+def _view(config: FilmConfig, env: Any, params: Any, drawn: Drawn, stretch: Any) -> View | None:
     """Returns what draws a row of an episode from behind; None, with a word about it, where there is no OpenGL."""
     from subterra_jax.physics.stage import scene_file  # MuJoCo is loaded only where physics is meant
     from subterra_jax.physics.view import RobotView
 
     file = None if config.scene is None else scene_file(config.scene, None)
-    choice = TunnelChoice(config.tunnel, piece=piece)
+    choice = TunnelChoice(config.tunnel, stretch=stretch)
     engine = env.motion.walk.physics if env.id in MISSIONS else env.motion.engine
     camera = RobotView(engine, params.track, choice, file, *_VIEW)
 

@@ -23,7 +23,7 @@ from subterra_jax.host.files import require_folder
 from subterra_jax.tasks import first_tunnel
 from train import tunnels
 
-_WHOLE = "Subterra/Traverse-v1"  # whose piece is the whole tunnel
+_WHOLE = "Subterra/Traverse-v1"  # whose stretch is the whole tunnel
 _COMPARED = 8  # tunnels of several in which the LiDAR is compared
 _progress = Console(stderr=True, highlight=False, emoji=False)
 
@@ -61,7 +61,7 @@ def run(config: ThroughputConfig) -> report.Result:
     result = report.Result(config, environment_facts(), facts, n_beams)
     if config.poses:
         _progress.print(f"exactness: {config.poses:,} poses in {len(plans)}")
-        # The comparison with the reference uses the whole tunnel, whichever piece the task uses.
+        # The comparison with the reference uses the whole tunnel, whichever stretch the task uses.
         whole = st.make(_WHOLE, made[: len(plans)] if count > 1 else made, lining)[1]
         result.exactness = measure_exactness(plans, config.lining, whole, config.poses, config.seed)
     timing = Timing(config.steps, config.repeats, config.seconds, config.seed)

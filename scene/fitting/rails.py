@@ -36,10 +36,10 @@ _FACE_RETURNS = 12  # of one face of a head
 # blur it more, a face may look sharp that is a centimetre off.
 _HEAD_SHARP = 0.025
 _FACE_SHARP = 0.006  # m: spread of returns about the face; twice 15 mm of band, evenly filled, have 0.0087
-_PIECE = 8.0  # m of track of which one gauge is measured
-_LEAST_PIECES = 2  # of track that show a gauge
+_STRETCH = 8.0  # m of track of which one gauge is measured
+_LEAST_STRETCHES = 2  # of track that show a gauge
 _SURE = 0.003  # standard error of a gauge that counts as measured, m
-_PIECES_AGREE = 0.004  # spread of the pieces, m: where poses blur the faces all pieces err alike, and more do not help
+_STRETCHES_AGREE = 0.004  # spread of stretches, m: where poses blur the faces all err alike, and more do not help
 _FEW_PIECES = 6  # whose spread is their standard deviation: three agree with their median by chance
 
 
@@ -64,15 +64,15 @@ class SeenRails:
     cant: Float[np.ndarray, " k"]  # Height of the left head over the right one, m
     apart: float  # Distance of the middles of the heads, about, m
     gauge: float  # Distance of the heads' inner faces below their tops, m; NaN where too few are seen
-    spread: float  # Standard deviation of the gauge from piece to piece, m
-    pieces: int  # Pieces of track that show a gauge
+    spread: float  # Standard deviation of the gauge from stretch to stretch, m
+    stretches: int  # Stretches of track that show a gauge
     top: float  # Median height of the heads' tops above the floor, m
 
     @property
     def measured(self) -> bool:
         """True where the gauge is known within a few millimetres."""
-        agree = self.spread < _PIECES_AGREE and self.spread / np.sqrt(self.pieces) < _SURE
-        return bool(self.pieces >= _LEAST_PIECES and agree)
+        agree = self.spread < _STRETCHES_AGREE and self.spread / np.sqrt(self.stretches) < _SURE
+        return bool(self.stretches >= _LEAST_STRETCHES and agree)
 
     def offset_at(self, station: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
         """Return the place of the track's middle to the left of the axis, m."""
@@ -142,8 +142,8 @@ def measure_again(rails: SeenRails, returns: LowPoints) -> SeenRails:
     """
     if len(returns.station) < _FACE_RETURNS:
         return rails
-    found = _measure(returns, rails.station, rails.offset, rails.apart, _CLEAR_FACE)
-    return replace(rails, gauge=found.gauge, spread=found.spread, pieces=found.pieces) if found.measured else rails
+    seen = _measure(returns, rails.station, rails.offset, rails.apart, _CLEAR_FACE)
+    return replace(rails, gauge=seen.gauge, spread=seen.spread, stretches=seen.stretches) if seen.measured else rails
 
 
 def _ridges(lateral: np.ndarray, height: np.ndarray, narrow: int) -> tuple[np.ndarray, np.ndarray]:
@@ -215,9 +215,9 @@ def _measure(
         offset = offset + np.where(np.isfinite(shift), shift, 0.0)
     offset = gaussian_filter1d(offset, 1.0, mode="nearest")
     across = lateral - np.interp(station, at, offset)
-    pieces = np.clip((station - at[0]) / _PIECE, 0, max(int(np.ptp(at) / _PIECE) - 1, 0)).astype(np.intp)
+    stretches = np.clip((station - at[0]) / _STRETCH, 0, max(int(np.ptp(at) / _STRETCH) - 1, 0)).astype(np.intp)
     below = {side: height - tops[side][block] for side in near}
-    gauge = _gauges(across, below, near, pieces, face)
+    gauge = _gauges(across, below, near, stretches, face)
     levels = [_block_medians(upward, block, rows, len(at)) for rows in heads.values()]
     cant = levels[0] - levels[1]
     known = np.isfinite(cant)
@@ -235,18 +235,18 @@ def _gauges(
     across: np.ndarray,
     below: dict[int, np.ndarray],
     near: dict[int, np.ndarray],
-    pieces: np.ndarray,
+    stretches: np.ndarray,
     face: tuple[float, float],
 ) -> Float[np.ndarray, " k"]:
-    """Measures the gauge of each piece of track that shows both inner faces, m.
+    """Measures the gauge of each stretch of track that shows both inner faces, m.
 
     `across` is to the left of the track's middle; `below`, height above the head's top, and `near` are given by side.
     """
-    gauges = np.zeros(int(pieces.max()) + 1)
-    for piece in range(len(gauges)):
+    gauges = np.zeros(int(stretches.max()) + 1)
+    for stretch in range(len(gauges)):
         for side, rows in near.items():
-            inside = rows & (pieces == piece)
-            gauges[piece] += _inner_edge((side * across)[inside], below[side][inside], face)
+            inside = rows & (stretches == stretch)
+            gauges[stretch] += _inner_edge((side * across)[inside], below[side][inside], face)
     return gauges[np.isfinite(gauges)]
 
 

@@ -80,7 +80,7 @@ class Judgement:
         return {
             **result, "tolerance": self.tolerance, "returns": float(self.returns.weight.sum()),
             "share": {**self.fractions, "scattered": self.scattered}, "wall_seen": self.coverage.fraction,
-            "unseen": [vars(piece) for piece in self.coverage.pieces[:_LISTED]],
+            "unseen": [vars(patch) for patch in self.coverage.patches[:_LISTED]],
             "places": [vars(place) for place in self.places[:_LISTED]],
             "worst_stations": [{"start": a, "end": b, "unexplained": fraction} for a, b, fraction in self.worst],
         }  # fmt: skip
@@ -168,7 +168,7 @@ def _warn_of_ends(bore: Bore, returns: Returns) -> list[Warned]:
         result.append(Warned(
             Code.BEYOND,
             f"{returns.fraction(BEYOND):.0%} of all returns lie beyond the ends of what was built, at 0 and "
-            f"{bore.length:.0f} m: terrain, a hall, or a piece of tunnel behind a gap, which is a cloud of its own",
+            f"{bore.length:.0f} m: terrain, a hall, or a stretch of tunnel behind a gap, which is a cloud of its own",
         ))  # fmt: skip
     for beyond, where, station in zip(measure_overruns(bore, returns), ("before", "beyond"), (0.0, bore.length),
                                       strict=True):  # fmt: skip
@@ -186,11 +186,11 @@ def _warn_of_unseen(coverage: Coverage) -> list[Warned]:
     return [
         Warned(
             Code.UNSEEN,
-            f"{name_span(piece.start, piece.end)} hardly a return lies {_on(piece.sides)} "
-            f"({piece.fraction:.0%} of the girth, {piece.area:.0f} m²): the wall there is a guess",
-            piece.start, piece.end,
+            f"{name_span(patch.start, patch.end)} hardly a return lies {_on(patch.sides)} "
+            f"({patch.fraction:.0%} of the girth, {patch.area:.0f} m²): the wall there is a guess",
+            patch.start, patch.end,
         )
-        for piece in coverage.pieces[:_LISTED] if piece.fraction > _WARN_UNSEEN
+        for patch in coverage.patches[:_LISTED] if patch.fraction > _WARN_UNSEEN
     ]  # fmt: skip
 
 

@@ -224,8 +224,8 @@ def _tables(judgement: Judgement, content: dict[str, Any]) -> list[str]:
         for place in judgement.places
     ]  # fmt: skip
     unseen = [
-        (name_span(piece.start, piece.end), piece.sides, f"{piece.area:.0f} m², {piece.fraction:.0%} of the girth")
-        for piece in (judgement.coverage.pieces if judgement.coverage is not None else ())
+        (name_span(patch.start, patch.end), patch.sides, f"{patch.area:.0f} m², {patch.fraction:.0%} of the girth")
+        for patch in (judgement.coverage.patches if judgement.coverage is not None else ())
     ]
     provenance = sorted(content.get("provenance", {}).items())
     detected = sorted(content.get("detected", {}).items())

@@ -254,14 +254,14 @@ def _describe(
 ROW = 1.0  # m
 SECTORS = 36  # directions
 _SPARSE = 0.03  # of the usual number of returns of a cell: with fewer it was not seen, as stray returns are everywhere
-_MIN_AREA = 3.0  # m² of wall in one piece: a smaller one is a shadow that its neighbours tell about
+_MIN_AREA = 3.0  # m² of wall in one patch: a smaller one is a shadow that its neighbours tell about
 _MIN_LENGTH, _MIN_GIRTH = 1.5, 0.9  # m
 _CENTRES = bin_angles(SECTORS)
 
 
 @dataclass(frozen=True)
 class Unseen:
-    """One piece of wall without returns."""
+    """One patch of wall without returns."""
 
     start: float  # First station, m
     end: float  # Last station, m
@@ -277,7 +277,7 @@ class Coverage:
     start: Float[np.ndarray, " r"]  # First station of each row of cells, m
     end: Float[np.ndarray, " r"]  # Last station, m
     seen: Bool[np.ndarray, "r c"]  # True where enough returns lie on the wall
-    pieces: tuple[Unseen, ...]  # Unseen pieces of some size, the largest first
+    patches: tuple[Unseen, ...]  # Unseen patches of some size, the largest first
 
     @property
     def fraction(self) -> float:
@@ -297,7 +297,7 @@ def find_unseen(bore: Bore, returns: Returns) -> Coverage:
     density = count / area
     usual = float(np.median(density[count > 0])) if (count > 0).any() else 1.0
     seen = density > _SPARSE * usual
-    return Coverage(edges[:-1], edges[1:], seen, _list_pieces(seen, area, edges))
+    return Coverage(edges[:-1], edges[1:], seen, _list_patches(seen, area, edges))
 
 
 _BEYOND = 20  # m beyond an end that are looked at
@@ -330,12 +330,12 @@ def _cell_areas(bore: Bore, edges: np.ndarray) -> Float[np.ndarray, "r c"]:
     return np.maximum(around[bore.row_of(middle)], 1e-3) * np.diff(edges)[:, None]
 
 
-def _list_pieces(seen: np.ndarray, area: np.ndarray, edges: np.ndarray) -> tuple[Unseen, ...]:
+def _list_patches(seen: np.ndarray, area: np.ndarray, edges: np.ndarray) -> tuple[Unseen, ...]:
     labels, count = label(~seen)
     both = labels[:, [0, -1]][~seen[:, 0] & ~seen[:, -1]].T  # the last column is beside the first
     joins = csr_matrix((np.ones(both.shape[1]), both), shape=(count + 1, count + 1))
     labels = connected_components(joins, directed=False)[1][labels]
-    pieces = []
+    patches = []
     for index in range(1, int(labels.max(initial=0)) + 1):
         row, column = np.nonzero(labels == index)
         if not len(row):
@@ -345,5 +345,5 @@ def _list_pieces(seen: np.ndarray, area: np.ndarray, edges: np.ndarray) -> tuple
         if size < _MIN_AREA or end - start < _MIN_LENGTH or size / (end - start) < _MIN_GIRTH:
             continue
         across = float(area[row.min() : row.max() + 1].sum())
-        pieces.append(Unseen(start, end, size, name_sides(_CENTRES[column], area[row, column]), size / across))
-    return tuple(sorted(pieces, key=lambda piece: (-piece.area, piece.start)))
+        patches.append(Unseen(start, end, size, name_sides(_CENTRES[column], area[row, column]), size / across))
+    return tuple(sorted(patches, key=lambda patch: (-patch.area, patch.start)))

@@ -208,7 +208,7 @@ class Convention:
     by_ring: Annotated[bool, _FLAG] = False  # Points in the order of rings, not of time.
     # What stands for a beam without return: nothing, a point in the sensor itself, or numbers that are none.
     empty: Annotated[Literal["left out", "zero", "nan"], _FLAG] = "left out"
-    pieces: Annotated[int, _FLAG] = 1  # Messages that a sweep is published in, one after another.
+    chunks: Annotated[int, _FLAG] = 1  # Messages that a sweep is published in, one after another.
     missing: Annotated[float, _FLAG] = 0.0  # Fraction of the messages that never came.
     big_endian: Annotated[bool, _FLAG] = False  # Numbers of points with their highest byte first.
     imu_late: Annotated[float, _FLAG] = 0.0  # How much later the IMU's clock is than the LiDAR's, s.
@@ -220,7 +220,7 @@ class Convention:
         for name in ("bad_times", "missing"):
             if not 0.0 <= getattr(self, name) < 1.0:
                 raise ValueError(f"{name} must lie between 0 and 1, got {getattr(self, name):g}")
-        for name in ("bags", "pieces"):
+        for name in ("bags", "chunks"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
         for name in ("boot", "imu_late"):
@@ -233,13 +233,13 @@ class Convention:
             raise ValueError("point_type u4 holds neither fractions nor times before the header")
 
 
-def pieces_of(sweep: Sweep, lidar: Lidar, convention: Convention) -> Iterator[tuple[Sweep, Lidar]]:
+def chunks_of(sweep: Sweep, lidar: Lidar, convention: Convention) -> Iterator[tuple[Sweep, Lidar]]:
     """Yields the parts of a sweep that are published as messages of their own, less those that never came."""
     rng = np.random.default_rng([sweep.number, 0x105])
-    for beams in np.array_split(np.arange(len(sweep.offset)), convention.pieces):
+    for beams in np.array_split(np.arange(len(sweep.offset)), convention.chunks):
         if rng.random() < convention.missing:
             continue
-        if convention.pieces == 1:
+        if convention.chunks == 1:
             yield sweep, lidar
             continue
         part = sweep.pick(beams)

@@ -29,7 +29,7 @@ from scene.survey.cast import Caster, Face, n_sweeps, sweeps
 from scene.survey.config import LidarName, SurveyConfig
 from scene.survey.lidar import SCAN_PERIOD, Lidar, Sweep, avia, os1, vlp16
 from scene.survey.mesh import Mesh
-from scene.survey.messages import Convention, Recorder, encode, pieces_of
+from scene.survey.messages import Convention, Recorder, chunks_of, encode
 from scene.survey.write import describe_truth, write_json, write_mesh, write_tum, write_yaml
 
 Message = tuple[int, str, bytes]  # time in ns since the start of the survey, topic, bytes
@@ -104,8 +104,8 @@ def write_recording(
             while at < end:
                 bag.write(topic, at, raw)
                 at, topic, raw = next(waiting)
-            for piece, lidar in pieces_of(sweep, device.lidar, convention):
-                bag.write(device.topic, end, device.encode(piece, lidar))
+            for chunk, lidar in chunks_of(sweep, device.lidar, convention):
+                bag.write(device.topic, end, device.encode(chunk, lidar))
             returns += int(sweep.valid.sum())
         while topic:
             bag.write(topic, at, raw)

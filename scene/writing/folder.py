@@ -24,7 +24,7 @@ from scene.inputs import MANIFEST_SCHEMA, library_versions
 from scene.judging.judge import Judgement
 from scene.judging.page import render_page
 from scene.poses.trajectory import Trajectory, save_tum
-from scene.writing.furnished import count_pieces, furnish_bore, planar_segments
+from scene.writing.furnished import count_items, furnish_bore, planar_segments
 from scene.writing.mesh import as_trimesh, build_solid, open_lining
 from scene.writing.mjcf import SceneConfig, write_scene
 from scene.writing.planar import Variant, cut_walls, save_tunnel, seams, shell_fields
@@ -132,7 +132,7 @@ def write_geometry(
     smooth = open_lining(as_trimesh(solids["smooth"]), bore)
     smooth.export(folder / "meshes" / "lining_smooth.ply")
     bore.save(folder / "bore.npz")
-    segments = {"furnished": planar_segments(furnished.pieces, bore, track.elevation, height)}
+    segments = {"furnished": planar_segments(furnished.items, bore, track.elevation, height)}
     bare, dressed = (folder / scene for scene in SCENES)
     variants = {
         "smooth": Variant(bore, False, bare),
@@ -142,7 +142,7 @@ def write_geometry(
     shell = shell_fields(bore, track.elevation, track.config, variants)
     plane = (bore, track.elevation, height, walls, segments)
     save_tunnel(folder / "tunnel.npz", name, provenance, *plane, shell, seams(variants))
-    placed = {f"furniture_{kind}": number for kind, number in count_pieces(furnished.pieces).items()}
+    placed = {f"furniture_{kind}": number for kind, number in count_items(furnished.items).items()}
     count |= {**placed, "furniture_niche": len(furnished.niches), "lining_faces": len(lining.faces)}
     return count, {"furniture": "by standard, in the variant furnished alone"}
 

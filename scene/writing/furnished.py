@@ -55,7 +55,7 @@ class FurnitureConfig:
 
 
 @dataclass(frozen=True)
-class Piece:
+class Item:
     """One box of furniture."""
 
     kind: str  # Kind of furniture
@@ -103,36 +103,36 @@ class TunnelSpace:
 
     def box(
         self, kind: str, material: str, span: tuple[float, float], across: tuple[float, float], up: tuple[float, float]
-    ) -> Piece:
+    ) -> Item:
         """Return a box between two stations, two distances left of the axis and two heights over the sleepers, m."""
         line = (self.bore.position[:, 0], self.bore.position[:, 1], self.track.elevation)
         foot = np.column_stack([np.interp(span, self.bore.station, values) for values in line])
         rotation = rotation_along(foot[0], foot[1])
         middle = foot.mean(axis=0) + rotation.apply([0, sum(across) / 2, sum(up) / 2])
         half = np.array([np.linalg.norm(foot[1] - foot[0]), across[1] - across[0], up[1] - up[0]]) / 2
-        return Piece(kind, material, middle, rotation, half, low=up[0] < _ROBOT_HEIGHT)
+        return Item(kind, material, middle, rotation, half, low=up[0] < _ROBOT_HEIGHT)
 
 
-def place_furniture(space: TunnelSpace) -> list[Piece]:
+def place_furniture(space: TunnelSpace) -> list[Item]:
     """Places everything that the configuration asks for and the bore has room for."""
     config = space.config
-    pieces: list[Piece] = []
+    items: list[Item] = []
     if config.walkway:
-        pieces += _walkway(space)
+        items += _walkway(space)
     if config.cables:
-        pieces += _cables(space)
+        items += _cables(space)
     if config.third_rail and len(space.track.sleeper_station) and space.track_reach < _ASIDE:
-        pieces += _third_rail(space)
+        items += _third_rail(space)
     if config.plates:
-        pieces += _plates(space)
+        items += _plates(space)
     if config.lamps:
-        pieces += _lamps(space)
-    return pieces
+        items += _lamps(space)
+    return items
 
 
-def count_pieces(pieces: list[Piece]) -> dict[str, int]:
+def count_items(items: list[Item]) -> dict[str, int]:
     """Counts the boxes of each kind."""
-    return dict(sorted(Counter(piece.kind for piece in pieces).items()))
+    return dict(sorted(Counter(item.kind for item in items).items()))
 
 
 def _stations(space: TunnelSpace, spacing: float, margin: float = 0.3) -> Float[np.ndarray, " k"]:
@@ -144,8 +144,8 @@ def _stretches(space: TunnelSpace, spacing: float) -> list[tuple[float, float]]:
     return list(zip(edge[:-1].tolist(), edge[1:].tolist(), strict=True))
 
 
-def _walkway(space: TunnelSpace) -> list[Piece]:
-    config, pieces = space.config, []
+def _walkway(space: TunnelSpace) -> list[Item]:
+    config, items = space.config, []
     laid = bool(len(space.track.sleeper_station))
     aside = space.track_reach if space.track_reach > _ASIDE else 0.0
     least = max(config.gauge, aside + space.track.config.sleeper_length / 2 + 0.05)
@@ -156,20 +156,20 @@ def _walkway(space: TunnelSpace) -> list[Piece]:
         inner = max(near - config.walkway_width, least)
         if near - inner < 0.5:
             continue
-        pieces.append(space.box("walkway", "concrete_slab", (start, end), (inner, far + 0.02), (foot, top)))
+        items.append(space.box("walkway", "concrete_slab", (start, end), (inner, far + 0.02), (foot, top)))
         wall = min(space.wall(start, end, height, 1)[0] for height in (top, (top + rail) / 2, rail)) - 0.12
         if not config.handrail or space.barred(start, end):
             continue
         middle = (start + end) / 2
         span = (middle - half, middle + half)
-        pieces.append(space.box("handrail_post", "galvanised", span, (wall - half, wall + half), (top, rail)))
+        items.append(space.box("handrail_post", "galvanised", span, (wall - half, wall + half), (top, rail)))
         tube = (wall - 0.02, wall + 0.02)
-        pieces.append(space.box("handrail", "galvanised", (start, end), tube, (rail - 0.04, rail)))
-    return pieces
+        items.append(space.box("handrail", "galvanised", (start, end), tube, (rail - 0.04, rail)))
+    return items
 
 
-def _cables(space: TunnelSpace) -> list[Piece]:
-    config, pieces = space.config, []
+def _cables(space: TunnelSpace) -> list[Item]:
+    config, items = space.config, []
     low, high = min(config.tiers) - 0.1, max(config.tiers) + 0.15
     # An arm begins at the wall at its own height: a wall that is dented there is the nearest.
     heights = (*np.linspace(low, high, 5), *config.tiers)
@@ -178,11 +178,11 @@ def _cables(space: TunnelSpace) -> list[Piece]:
         near = min(space.wall(station, station, height, -1)[0] for height in heights)
         if near - config.bracket_length < config.gauge:
             continue
-        pieces.append(space.box("bracket", "galvanised", span, (-near, -near + 0.05), (low, high)))
+        items.append(space.box("bracket", "galvanised", span, (-near, -near + 0.05), (low, high)))
         for tier in config.tiers:
             far = space.wall(station, station, tier, -1)[1]
             arm = (-far, -near + config.bracket_length)
-            pieces.append(space.box("bracket_arm", "galvanised", span, arm, (tier - 0.04, tier)))
+            items.append(space.box("bracket_arm", "galvanised", span, arm, (tier - 0.04, tier)))
     for start, end in _stretches(space, 2 * config.bracket_spacing):
         near = min(space.wall(start, end, height, -1)[0] for height in heights)
         if near - config.bracket_length < config.gauge:
@@ -190,12 +190,12 @@ def _cables(space: TunnelSpace) -> list[Piece]:
         middle, half = -near + config.bracket_length / 2, config.cable_diameter / 2
         for tier in config.tiers:
             across = (middle - 2 * half, middle + 2 * half)
-            pieces.append(space.box("cable", "cable", (start, end + 0.02), across, (tier, tier + 2 * half)))
-    return pieces
+            items.append(space.box("cable", "cable", (start, end + 0.02), across, (tier, tier + 2 * half)))
+    return items
 
 
-def _third_rail(space: TunnelSpace) -> list[Piece]:
-    config, track, pieces = space.config, space.track.config, []
+def _third_rail(space: TunnelSpace) -> list[Item]:
+    config, track, items = space.config, space.track.config, []
     middle = -(track.rail_offset + config.third_rail_offset)
     top = track.pad_thickness + track.rail.height + 0.076
     for start, end in _stretches(space, 3.0):
@@ -203,32 +203,32 @@ def _third_rail(space: TunnelSpace) -> list[Piece]:
             continue
         rail, pot, cover = ((middle - half, middle + half) for half in (0.04, 0.05, 0.08))
         span = (start + 0.5 - 0.05, start + 0.5 + 0.05)
-        pieces.append(space.box("third_rail", "galvanised", (start, end + 0.02), rail, (top - 0.1, top)))
-        pieces.append(space.box("insulator", "insulator", span, pot, (-track.protrusion, top - 0.1)))
-        pieces.append(space.box("third_rail_cover", "cover", (start, end), cover, (top + 0.05, top + 0.07)))
-    return pieces
+        items.append(space.box("third_rail", "galvanised", (start, end + 0.02), rail, (top - 0.1, top)))
+        items.append(space.box("insulator", "insulator", span, pot, (-track.protrusion, top - 0.1)))
+        items.append(space.box("third_rail_cover", "cover", (start, end), cover, (top + 0.05, top + 0.07)))
+    return items
 
 
-def _plates(space: TunnelSpace) -> list[Piece]:
-    pieces = []
+def _plates(space: TunnelSpace) -> list[Item]:
+    items = []
     for station in np.arange(space.config.plate_spacing, space.bore.length - 0.5, space.config.plate_spacing):
         if space.barred(station - 0.3, station + 0.3):
             continue
         near = min(space.wall(station - 0.25, station + 0.25, height, 1)[0] for height in (1.65, 1.95))
         span = (station - 0.25, station + 0.25)
-        pieces.append(space.box("hectometre_plate", "plate", span, (near - 0.03, near), (1.65, 1.95)))
-    return pieces
+        items.append(space.box("hectometre_plate", "plate", span, (near - 0.03, near), (1.65, 1.95)))
+    return items
 
 
-def _lamps(space: TunnelSpace) -> list[Piece]:
-    pieces, bore = [], space.bore
+def _lamps(space: TunnelSpace) -> list[Item]:
+    items, bore = [], space.bore
     crown = bore.toward(np.pi / 2)
     ceiling = bore.position[:, 2] + crown * bore.up[:, 2] - space.track.elevation
     for station in _stations(space, space.config.lamp_spacing):
         height = float(np.interp(station, bore.station, ceiling))
         span = (station - 0.6, station + 0.6)
-        pieces.append(space.box("lamp", "lamp", span, (-0.09, 0.09), (height - 0.14, height - 0.04)))
-    return pieces
+        items.append(space.box("lamp", "lamp", span, (-0.09, 0.09), (height - 0.14, height - 0.04)))
+    return items
 
 
 _DOOR = (1.2, 0.08, 2.0)  # length, thickness, height, m
@@ -241,7 +241,7 @@ class Furnished:
     """A bore and what stands in it."""
 
     bore: Bore  # With the niches among its pockets, in place of the pockets they take away
-    pieces: list[Piece]  # The furniture
+    items: list[Item]  # The furniture
     openings: list[Opening]  # Parts of the wall that niches take out
     niches: list[tuple[float, float]]  # First and last station of each niche, m
     niche_corners: list[Float[np.ndarray, "8 3"]]  # Corners of the air of each niche, m
@@ -258,20 +258,20 @@ def furnish_bore(bore: Bore, track: Track, config: FurnitureConfig) -> Furnished
     with_niches = replace(bore, pocket=np.concatenate([bore.pocket[keep], niche]))
     number = np.arange(keep.sum(), len(with_niches.pocket))
     corners = [_cut_flush(box) for box in with_niches.recess_boxes(number)]
-    pieces = place_furniture(TunnelSpace(bore, track, config, spans)) + [_niche_door(corner) for corner in corners]
-    return Furnished(with_niches, pieces, openings, spans, corners)
+    items = place_furniture(TunnelSpace(bore, track, config, spans)) + [_niche_door(corner) for corner in corners]
+    return Furnished(with_niches, items, openings, spans, corners)
 
 
 def planar_segments(
-    pieces: list[Piece], bore: Bore, elevation: Float[np.ndarray, " n"], height: float
+    items: list[Item], bore: Bore, elevation: Float[np.ndarray, " n"], height: float
 ) -> Float[np.ndarray, "f 4"]:
-    """Return outlines of the pieces where a surface `height` m above the track cuts them.
+    """Return outlines of the items where a surface `height` m above the track cuts them.
 
-    They are segments `x0, y0, x1, y1`, m; those of one piece follow one another and close.
+    They are segments `x0, y0, x1, y1`, m; those of one item follow one another and close.
     """
-    if not pieces:
+    if not items:
         return np.empty((0, 4))
-    corners = np.stack([piece.corners() for piece in pieces])
+    corners = np.stack([item.corners() for item in items])
     station = bore.axis.local(corners.reshape(-1, 3))[0]
     level = corners[..., 2] - np.interp(station, bore.station, elevation).reshape(corners.shape[:2]) - height
     outlines = []
@@ -323,7 +323,7 @@ def _overlaps(bore: Bore, niche: np.void) -> np.ndarray:
     return beside & (across < (pocket["width"] + niche["width"]) / 2 + _FRAME)
 
 
-def _niche_door(corners: Float[np.ndarray, "8 3"]) -> Piece:
+def _niche_door(corners: Float[np.ndarray, "8 3"]) -> Item:
     grid = corners.reshape(2, 2, 2, 3)
     x, z = grid[1, 0, 1] - grid[0, 0, 1], grid[0, 1, 1] - grid[0, 0, 1]
     half = np.array([min(_DOOR[0], np.linalg.norm(x)), _DOOR[1], min(_DOOR[2], np.linalg.norm(z))]) / 2
@@ -331,7 +331,7 @@ def _niche_door(corners: Float[np.ndarray, "8 3"]) -> Piece:
     foot = (grid[0, 0, 1] + grid[1, 0, 1]) / 2
     inwards = grid[0, 0, 0] - grid[0, 0, 1]
     centre = foot + half[2] * z + half[1] * inwards / np.linalg.norm(inwards)
-    return Piece(
+    return Item(
         "passage_door", "door", centre, Rotation.from_matrix(np.column_stack([x, np.cross(z, x), z])), half, True
     )
 

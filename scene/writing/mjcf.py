@@ -274,9 +274,9 @@ def _add_lining(
 
 
 def _add_furniture(world: ET.Element, furnished: Furnished) -> None:
-    for k, piece in enumerate(furnished.pieces):
-        bits = SOLID | LOW_WALL if piece.low else SOLID
-        name = f"{piece.kind}_{k:05d}"
-        add_box(world, name, piece.half, piece.centre, piece.rotation, bits, group="1", material=piece.material)
+    for k, item in enumerate(furnished.items):
+        bits = SOLID | LOW_WALL if item.low else SOLID
+        name = f"{item.kind}_{k:05d}"
+        add_box(world, name, item.half, item.centre, item.rotation, bits, group="1", material=item.material)
     for k, corners in enumerate(furnished.niche_corners):
         add_niche(world, f"niche_{k:02d}", corners)

@@ -239,7 +239,7 @@ def _describe_line(line: Line, rails: SeenRails | None) -> dict[str, Any]:
         "gauge": line.gauge, "gauge_from": "measured" if line.gauge_measured else "by standard",
         "gauge_seen": rails.gauge if rails is not None and known else None,
         "gauge_spread": rails.spread if rails is not None and known else None,
-        "gauge_pieces": rails.pieces if rails is not None else 0,
+        "gauge_pieces": rails.stretches if rails is not None else 0,
         "rail_top_seen": rails.top if rails is not None else None, "rail_height": line.rail_height,
         "offset": [float(line.offset.min()), float(line.offset.max())], "cant_mean": float(np.mean(line.cant)),
         "cant_spread": float(np.std(line.cant)), "cant_from": "measured" if rails is not None else "by standard",

@@ -30,7 +30,7 @@ MIN_ROWS = 8
 N_WINDOW = 4  # rows in the window: ± 1 m about the robot, further than wheels and feet reach
 N_PLANES = 2  # planes that one ball or wheel can touch at once
 _FAR = 1.0  # gap to what is not there, m
-_BEYOND, _ASIDE = 5.0, 1.0  # sleepers so far outside the piece, or aside of the first track, are not taken, m
+_BEYOND, _ASIDE = 5.0, 1.0  # sleepers so far outside the stretch, or aside of the first track, are not taken, m
 _SLAB = 1.0  # half the width from which a flat brick is the bed, m
 
 

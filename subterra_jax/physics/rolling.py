@@ -82,7 +82,7 @@ def on_rover(
     env: TunnelEnv,
     tunnel: Source | Sequence[Source],
     lining: str | None,
-    piece: tuple[float, float] | None,
+    stretch: tuple[float, float] | None,
     overrides: Mapping[str, Any],
     hidden_start: bool = False,
 ) -> tuple[TunnelEnv, dict[str, Any]]:
@@ -92,7 +92,7 @@ def on_rover(
         env: The task on wheels.
         tunnel: As for `subterra_jax.make`.
         lining: As for `subterra_jax.make`.
-        piece: Start and length of the piece of tunnel, m; None for the whole.
+        stretch: Start and length of the stretch of tunnel, m; None for the whole.
         overrides: Entries in place of the defaults; and `engine`: `mjx`, for thousands on a GPU, or `mujoco`, in C on
             the host, for a few; and `scene`, the folder of a built scene, whose `scene.xml` that engine takes and whose
             triangles the LiDAR sees.
@@ -104,16 +104,16 @@ def on_rover(
     """
     asked = dict(overrides)
     engine, scene = asked.pop("engine", ENGINES[0]), asked.pop("scene", None)
-    plans = [_plan(source, piece) for source in ([tunnel] if isinstance(tunnel, Tunnel) else list_sources(tunnel))]
+    plans = [_plan(source, stretch) for source in ([tunnel] if isinstance(tunnel, Tunnel) else list_sources(tunnel))]
     stage = settle(ROVER, plans, lining, scene, engine)
     return stage.mount(env, Rover(engine=stage.engine), asked, "start" in overrides and not hidden_start)
 
 
-def _plan(source: Source, piece: tuple[float, float] | None) -> TunnelPlan:
+def _plan(source: Source, stretch: tuple[float, float] | None) -> TunnelPlan:
     if isinstance(source, Tunnel):
         raise ValueError("motion='rover' needs the tunnel's name, file or plan: a ready Tunnel holds no heights")
     plan = source if isinstance(source, TunnelPlan) else load_tunnel(source)
-    if piece is None:
+    if stretch is None:
         return plan
-    start, length = piece
+    start, length = stretch
     return plan.slice(start, min(length, plan.length - start))

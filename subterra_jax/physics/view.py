@@ -12,7 +12,7 @@ from subterra_jax.physics.engine import PREFIX, Engine
 from subterra_jax.physics.ground import Track
 from subterra_jax.physics.stage import scene_world
 from subterra_jax.pictures.camera import FollowCamera, TunnelChoice
-from subterra_jax.pictures.stage import Piece
+from subterra_jax.pictures.stage import Stretch
 
 _BEHIND, _PITCH_DEG, _ASIDE_DEG = 2.9, -15.0, 24.0  # of the point looked at: m, degrees, degrees
 _AHEAD, _BELOW = 0.35, 0.1  # of the trunk, that point, m
@@ -84,7 +84,7 @@ class RobotView:
         if "_camera" in self.__dict__:
             self._camera.close()
 
-    def _add_robot(self, spec: mujoco.MjSpec, piece: Piece | None) -> None:
+    def _add_robot(self, spec: mujoco.MjSpec, stretch: Stretch | None) -> None:
         robot = self._machine.spec()
         if self._machine.dress is not None:
             self._machine.dress(robot)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from subterra_jax.pictures.renderer import import_mujoco, light_near, open_renderer
-from subterra_jax.pictures.stage import Piece, stage_spec
+from subterra_jax.pictures.stage import Stretch, stage_spec
 from subterra_jax.procedural import expand
 from subterra_jax.tunnel import Tunnel
 from subterra_jax.tunnel.plan import TunnelPlan
@@ -25,8 +25,8 @@ class TunnelChoice:
 
     tunnel: Source | Sequence[Source] = None  # as for `subterra_jax.make`
     lining: str | None = None  # as for `subterra_jax.make`
-    # start and length of the piece that the task cuts out, m; `None` for the whole
-    piece: tuple[float, float] | None = None
+    # start and length of the stretch that the task cuts out, m; `None` for the whole
+    stretch: tuple[float, float] | None = None
     texture: float = 0.0  # as for `subterra_jax.make`
 
     def plan(self, number: int) -> TunnelPlan:
@@ -43,21 +43,21 @@ class TunnelChoice:
         if isinstance(source, Tunnel):
             raise ValueError("view='mujoco' needs the tunnel's name, file or plan: a ready Tunnel holds no heights")
         plan = source if isinstance(source, TunnelPlan) else load_tunnel(source, solid=True)
-        if self.piece is None:
+        if self.stretch is None:
             return plan
-        start, length = self.piece
+        start, length = self.stretch
         return plan.slice(start, min(length, plan.length - start))
 
 
 class FollowCamera:
-    """Draws a robot from behind, in a scene or in a piece of 100 m of its tunnel's bore at a time.
+    """Draws a robot from behind, in a scene or in a stretch of 100 m of its tunnel's bore at a time.
 
     Args:
         choice: The tunnels to draw.
         width: Width of a picture, pixels.
         height: Height of a picture, pixels.
         model: Model of a scene to draw instead.
-        furnish: Adds to the model of a piece what its plan does not hold.
+        furnish: Adds to the model of a stretch what its plan does not hold.
 
     Attributes:
         model: Present model.
@@ -70,20 +70,20 @@ class FollowCamera:
         width: int,
         height: int,
         model: "mujoco.MjModel | None" = None,
-        furnish: "Callable[[mujoco.MjSpec, Piece], None] | None" = None,
+        furnish: "Callable[[mujoco.MjSpec, Stretch], None] | None" = None,
     ):
         self._mujoco = import_mujoco("a picture by MuJoCo")
         self._choice, self._size, self._furnish = choice, (width, height), furnish
         self._renderer: mujoco.Renderer | None = None
         self._plans: dict[int, TunnelPlan] = {}
-        self._piece: Piece | None = None
+        self._stretch: Stretch | None = None
         self.model: mujoco.MjModel
         self.data: mujoco.MjData
         if model is not None:
             self._show(model)
 
     def follow(self, number: int, position: Float[np.ndarray, "3"], ahead: Float[np.ndarray, "3"]) -> TunnelPlan:
-        """Take the piece of a tunnel around a robot, unless the present one shows it; return the tunnel.
+        """Take the stretch of a tunnel around a robot, unless the present one shows it; return the tunnel.
 
         Args:
             number: Number of the tunnel.
@@ -98,13 +98,13 @@ class FollowCamera:
         plan = self._plans[number]
         node = int(np.argmin(np.sum((plan.centre - position[:2]) ** 2, axis=1)))
         station, facing = float(plan.station[node]), float(ahead[:2] @ plan.tangent[node])
-        if self._piece is not None and self._piece.plan is plan and self._piece.shows(station, facing):
+        if self._stretch is not None and self._stretch.plan is plan and self._stretch.shows(station, facing):
             return plan
-        piece = Piece.around(plan, self._choice.lining, station, facing)
-        self._piece = dataclasses.replace(piece, texture=self._choice.texture)
-        spec = stage_spec(self._piece)
+        stretch = Stretch.around(plan, self._choice.lining, station, facing)
+        self._stretch = dataclasses.replace(stretch, texture=self._choice.texture)
+        spec = stage_spec(self._stretch)
         if self._furnish is not None:
-            self._furnish(spec, self._piece)
+            self._furnish(spec, self._stretch)
         self._show(spec.compile())
         return plan
 

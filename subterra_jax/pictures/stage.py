@@ -1,4 +1,4 @@
-"""A MuJoCo model of a piece of tunnel, for pictures alone: nothing in it collides; and the wheeled robot in it."""
+"""A MuJoCo model of a stretch of tunnel, for pictures alone: nothing in it collides; and the wheeled robot in it."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 from typing import NamedTuple
 
-BEHIND, AHEAD = 30.0, 70.0  # of the robot, m: the piece that is drawn
-_MARGIN = 20.0  # m from the end of a piece at which the next one is made
+BEHIND, AHEAD = 30.0, 70.0  # of the robot, m: the stretch that is drawn
+_MARGIN = 20.0  # m from the end of a stretch at which the next one is made
 _LAMP_SPACING, _BELOW_CROWN, _CROWN = 8.0, 0.5, 5.0  # m
 _TILE, _PIXELS = 4.0, 512  # of a texture of noise: m, pixels
 _PIXEL = 0.05  # m of the wall's own brightness
@@ -27,8 +27,8 @@ _DARK = 0.05  # grey of what lies beyond the fog
 
 
 @dataclasses.dataclass(frozen=True)
-class Piece:
-    """A piece of a tunnel."""
+class Stretch:
+    """A stretch of a tunnel."""
 
     plan: TunnelPlan  # the tunnel
     lining: str | None  # variant of its walls
@@ -37,8 +37,8 @@ class Piece:
     texture: float = 0.0  # dial of the walls' brightness, 0 to 1
 
     @classmethod
-    def around(cls, plan: TunnelPlan, lining: str | None, station: float, facing: float = 1.0) -> Piece:
-        """Return the piece to draw for a robot at a station, m, that looks along (1) or against (-1) the axis."""
+    def around(cls, plan: TunnelPlan, lining: str | None, station: float, facing: float = 1.0) -> Stretch:
+        """Return the stretch to draw for a robot at a station, m, that looks along (1) or against (-1) the axis."""
         before, after = (BEHIND, AHEAD) if facing > 0.0 else (AHEAD, BEHIND)
         return cls(plan, lining, max(station - before, 0.0), min(station + after, plan.length))
 
@@ -49,8 +49,8 @@ class Piece:
         return bool(enough and (self.end >= self.plan.length or self.end - station >= after))
 
 
-def stage_spec(piece: Piece) -> mujoco.MjSpec:
-    """Return the model of a piece: its surfaces in the tunnel frame, lamps below the crown and fog.
+def stage_spec(stretch: Stretch) -> mujoco.MjSpec:
+    """Return the model of a stretch: its surfaces in the tunnel frame, lamps below the crown and fog.
 
     Raises:
         TunnelError: The plan does not have the lining.
@@ -60,16 +60,16 @@ def stage_spec(piece: Piece) -> mujoco.MjSpec:
     spec = mujoco.MjSpec()
     spec.modelname = "tunnel"
     _set_view(spec)
-    _add_sky(spec, piece)
+    _add_sky(spec, stretch)
     pixels, of_wall = _noise_picture(), (_TILE, _TILE)
     _add_picture(spec, "noise", pixels)
-    if piece.texture > 0.0 and piece.plan.texture is not None and piece.plan.shell is not None:
-        pixels, of_wall = _wall_picture(piece, piece.plan.shell, piece.plan.texture)
+    if stretch.texture > 0.0 and stretch.plan.texture is not None and stretch.plan.shell is not None:
+        pixels, of_wall = _wall_picture(stretch, stretch.plan.shell, stretch.plan.texture)
     _add_picture(spec, "wall", pixels)
-    for surface in tunnel_surfaces(piece.plan, piece.lining, piece.start, piece.end):
+    for surface in tunnel_surfaces(stretch.plan, stretch.lining, stretch.start, stretch.end):
         walled = surface.name == "wall"
         add_surface(spec, surface, *(("wall", of_wall) if walled else ()))
-    for k, place in enumerate(_lamps(piece)):
+    for k, place in enumerate(_lamps(stretch)):
         spec.worldbody.add_light(
             name=f"lamp_{k}", pos=place, dir=(0.0, 0.0, -1.0), cutoff=180.0, exponent=0.0, castshadow=False,
             attenuation=(1.0, 0.05, 0.03), diffuse=(0.95, 0.91, 0.80), specular=(0.2, 0.2, 0.18), active=False,
@@ -131,16 +131,16 @@ def _set_view(spec: mujoco.MjSpec) -> None:
     visual.quality.offsamples = 4
 
 
-def _add_sky(spec: mujoco.MjSpec, piece: Piece) -> None:
-    """Adds daylight at mouths, and darkness at other ends of the piece."""
+def _add_sky(spec: mujoco.MjSpec, stretch: Stretch) -> None:
+    """Adds daylight at mouths, and darkness at other ends of the stretch."""
     import mujoco
 
     spec.add_texture(
         name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
         rgb1=(0.55, 0.70, 0.88), rgb2=(0.90, 0.93, 0.96), width=64, height=384,
     )  # fmt: skip
-    plan = piece.plan
-    for station, mouth in ((piece.start, 0.0), (piece.end, plan.length)):
+    plan = stretch.plan
+    for station, mouth in ((stretch.start, 0.0), (stretch.end, plan.length)):
         if station == mouth:
             continue
         node = int(np.argmin(np.abs(plan.station - station)))
@@ -149,12 +149,12 @@ def _add_sky(spec: mujoco.MjSpec, piece: Piece) -> None:
         add_box(spec, (0.05, 12.0, 15.0), (*plan.centre[node], plan.elevation[node]), turn, (_DARK, _DARK, _DARK))
 
 
-def _lamps(piece: Piece) -> Float[np.ndarray, "k 3"]:
+def _lamps(stretch: Stretch) -> Float[np.ndarray, "k 3"]:
     """Return places below the crown, m; of an assumed height where the plan has no shell."""
-    plan = piece.plan
-    station = np.arange(_LAMP_SPACING * np.ceil(piece.start / _LAMP_SPACING) + 0.5 * _LAMP_SPACING, piece.end, 8.0)
+    plan = stretch.plan
+    station = np.arange(_LAMP_SPACING * np.ceil(stretch.start / _LAMP_SPACING) + 0.5 * _LAMP_SPACING, stretch.end, 8.0)
     if len(station) == 0:
-        station = np.array([0.5 * (piece.start + piece.end)])
+        station = np.array([0.5 * (stretch.start + stretch.end)])
     if plan.shell is None:
         columns = np.column_stack([plan.centre, plan.elevation + _CROWN - _BELOW_CROWN]).T
         return np.stack([np.interp(station, plan.station, column) for column in columns], axis=-1)
@@ -164,20 +164,20 @@ def _lamps(piece: Piece) -> Float[np.ndarray, "k 3"]:
     return np.stack([np.interp(station + shell.window[0], shell.station, column) for column in columns], axis=-1)
 
 
-def _wall_picture(piece: Piece, shell: Shell, seed: int) -> tuple[np.ndarray, tuple[float, float]]:
-    """Return a picture of the brightness of a piece's wall, `(around, along, 3)` uint8, and its size along and around.
+def _wall_picture(stretch: Stretch, shell: Shell, seed: int) -> tuple[np.ndarray, tuple[float, float]]:
+    """Return a picture of the brightness of the wall, `(around, along, 3)` uint8, and its size along and around.
 
     It is for walls unrolled as by `surfaces`; what is off the bore's usual section lies a little beside its place.
     """
-    radius, own = np.median(shell.section), shell.window[0] + np.array([piece.start - AROUND, piece.end + AROUND])
+    radius, own = np.median(shell.section), shell.window[0] + np.array([stretch.start - AROUND, stretch.end + AROUND])
     first = shell.station[shell.station >= own[0]][0] - shell.window[0]
     station = first + (np.arange(int(np.ptp(own) / _PIXEL)) + 0.5) * _PIXEL
     turn = (np.arange(int(2.0 * np.pi * radius / _PIXEL)) + 0.5) * _PIXEL / radius
     reach = np.interp(turn, shell.angle, shell.section, period=2.0 * np.pi)
-    ground = np.interp(station, piece.plan.station, piece.plan.elevation)
+    ground = np.interp(station, stretch.plan.station, stretch.plan.elevation)
     height = np.median(np.interp(station + shell.window[0], shell.station, shell.position[:, 2]) - ground)
     angle = wall_angle(np, reach * np.cos(turn), reach * np.sin(turn) + height)
-    shade = np.clip(0.8 * brightness(np, station[None], angle[:, None], seed, piece.texture), 0.0, 1.0)
+    shade = np.clip(0.8 * brightness(np, station[None], angle[:, None], seed, stretch.texture), 0.0, 1.0)
     pixels = np.repeat((255.0 * shade).astype(np.uint8)[..., None], 3, axis=2)
     return pixels, (len(station) * _PIXEL, 2.0 * np.pi * radius)
 

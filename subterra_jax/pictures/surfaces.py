@@ -1,4 +1,4 @@
-"""The visible surfaces of a piece of a tunnel, from its plan alone: wall, recesses, floor, track and furniture."""
+"""The visible surfaces of a stretch of a tunnel, from its plan alone: wall, recesses, floor, track and furniture."""
 
 import dataclasses
 
@@ -17,7 +17,7 @@ WALL, RECESS, FLOOR = (0.66, 0.65, 0.62), (0.36, 0.355, 0.345), (0.43, 0.41, 0.3
 _STEEL, _SLEEPER, _FURNITURE = (0.40, 0.33, 0.28), (0.62, 0.61, 0.58), (0.38, 0.47, 0.53)
 _LEVEL = 0.7  # cosine of the steepest floor
 _SUNK, _RIM = 0.02, 0.03  # m behind the smooth wall and beyond a recess's sides, to which its points belong to it
-AROUND = 6.0  # m of shell kept beyond the piece, so that recesses at its ends are whole
+AROUND = 6.0  # m of shell kept beyond the stretch, so that recesses at its ends are whole
 _THIN = 0.08  # m; a part of the track whose half width is less is a rail: feet have 0.075
 
 
@@ -74,7 +74,7 @@ def tunnel_surfaces(plan: TunnelPlan, lining: str | None, start: float, end: flo
 
 
 def short_shell(shell: Shell, start: float, end: float) -> Shell:
-    """Return a shell of its own for a piece: unlike `Shell.cut` it holds nothing of the rest.
+    """Return a shell of its own for a stretch: unlike `Shell.cut` it holds nothing of the rest.
 
     Its triangles are not exactly those of the whole, and it is much quicker to triangulate.
 

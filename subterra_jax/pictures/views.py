@@ -64,7 +64,7 @@ def view_for(
     """Return the view of an environment that `subterra_jax.make` is to make, and its tunnel; errors as there."""
     known = TASKS.get(id := find(task))
     tunnel = tunnel_for(id, tunnel, split, spatial=not is_planar(sensor))
-    return make_view(view, TunnelChoice(tunnel, lining, None if known is None else known.piece, texture)), tunnel
+    return make_view(view, TunnelChoice(tunnel, lining, None if known is None else known.stretch, texture)), tunnel
 
 
 class TopView:

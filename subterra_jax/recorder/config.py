@@ -105,7 +105,7 @@ class World:
     Attributes:
         env: The environment.
         params: The task.
-        plan: Piece of tunnel of the task.
+        plan: Stretch of tunnel of the task.
     """
 
     env: TunnelEnv
@@ -171,8 +171,9 @@ def open_place(
         physics["motion"] = motion
     given = plan if physics.get("scene") is None else None
     env, params = st.make(task, given, lining, sensor=sensor, **physics)
-    piece = TASKS[task].piece if task in TASKS else None
-    return World(env, params, plan if piece is None else plan.slice(piece[0], min(piece[1], plan.length - piece[0])))
+    if cut := TASKS[task].stretch if task in TASKS else None:
+        plan = plan.slice(cut[0], min(cut[1], plan.length - cut[0]))
+    return World(env, params, plan)
 
 
 def open_agent(config: RecorderConfig, world: World) -> Agent:

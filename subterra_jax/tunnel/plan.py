@@ -96,14 +96,14 @@ class TunnelPlan:
         return self.linings[name]
 
     def slice(self, start: float, length: float) -> TunnelPlan:
-        """Return the piece from `start` to `start + length`, with stations from 0 and both mouths open.
+        """Return the stretch from `start` to `start + length`, with stations from 0 and both mouths open.
 
         Args:
-            start: Station at which the piece begins, m.
-            length: Length of the piece, m; the station grid keeps its spacing as nearly as a uniform grid allows.
+            start: Station at which the stretch begins, m.
+            length: Length of the stretch, m; the station grid keeps its spacing as nearly as a uniform grid allows.
 
         Raises:
-            ValueError: The piece does not lie within the tunnel.
+            ValueError: The stretch does not lie within the tunnel.
         """
         end = start + length
         if not (0.0 <= start < end <= self.length + 1e-9):

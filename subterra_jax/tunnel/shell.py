@@ -41,7 +41,7 @@ class Shell:
     track: np.ndarray  # rails, sleepers and slab of every variant, see `make_bricks`, `(t, 13)`
     linings: dict[str, ShellLining]  # variant name to what it adds
     spacing: tuple[float, float] = SPACING  # distance of the points of the triangulated wall, along and around, m
-    window: tuple[float, float] = (0.0, np.inf)  # first and last station of the piece that was cut out, m
+    window: tuple[float, float] = (0.0, np.inf)  # first and last station of the stretch that was cut out, m
 
     @property
     def left(self) -> np.ndarray:
@@ -55,7 +55,7 @@ class Shell:
         return np.cross(self.tangent, self.left)
 
     def cut(self, start: float, end: float) -> Shell:
-        """Return the piece between two stations of this piece, m. Its arrays stay whole, so that no point moves."""
+        """Return the stretch between two stations of this stretch, m. Its arrays stay whole, so that no point moves."""
         first, last = self.window
         return dataclasses.replace(self, window=(first + start, min(first + end, last)))
 

@@ -102,7 +102,7 @@ def tunnel_digest(path: str | Path | None = None) -> str:
 def resolve(
     tunnel: Source | Sequence[Source],
     lining: str | None,
-    piece: tuple[float, float] | None,
+    stretch: tuple[float, float] | None,
     reach: float,
     spatial: bool = False,
 ) -> Tunnel:
@@ -112,8 +112,8 @@ def resolve(
         tunnel: A `Tunnel`, which is returned unchanged; a plan; a file or name, as for `load_tunnel`; `None` for the
             packaged tunnel; or a list of these, which becomes one stack, as does a name like `open:train:0-255`.
         lining: Variant of the walls; `None` is `pockets`, or the first where a tunnel has none.
-        piece: Start and length of the piece to cut out, m; `None` keeps the whole tunnel. A piece beyond the tunnel's
-            end is shortened.
+        stretch: Start and length of the stretch to cut out, m; `None` keeps the whole tunnel. A stretch beyond the end
+            is shortened.
         reach: Largest range of a planar LiDAR, m.
         spatial: Add the tunnel's `Space`, which a LiDAR in three dimensions needs.
 
@@ -122,11 +122,11 @@ def resolve(
         ValueError: A `Tunnel` was made for shorter ranges or for planar LiDARs alone, or the list is empty.
     """
     if isinstance(tunnel, Tunnel):
-        return _single(tunnel, lining, piece, reach, spatial)
+        return _single(tunnel, lining, stretch, reach, spatial)
     sources = list_sources(tunnel)
     if not spatial and all(isinstance(each, str) and _is_ours(each) for each in sources):
-        return jax.device_put(_named(tuple(sources), lining, piece, reach))
-    return _joined(sources, lining, piece, reach, spatial)
+        return jax.device_put(_named(tuple(sources), lining, stretch, reach))
+    return _joined(sources, lining, stretch, reach, spatial)
 
 
 def list_sources(tunnel: TunnelPlan | str | Path | Sequence[Source] | None) -> list[Source]:
@@ -148,16 +148,16 @@ def _is_ours(name: str) -> bool:
 
 
 @functools.lru_cache(maxsize=8)
-def _named(names: tuple[str, ...], lining: str | None, piece: tuple[float, float] | None, reach: float) -> Tunnel:
+def _named(names: tuple[str, ...], lining: str | None, stretch: tuple[float, float] | None, reach: float) -> Tunnel:
     """Return tunnels by name, on the host: a process makes a task many times, and may give away what it got."""
-    return jax.device_get(_joined(names, lining, piece, reach, False))
+    return jax.device_get(_joined(names, lining, stretch, reach, False))
 
 
 def _joined(
-    sources: Sequence[Source], lining: str | None, piece: tuple[float, float] | None, reach: float, spatial: bool
+    sources: Sequence[Source], lining: str | None, stretch: tuple[float, float] | None, reach: float, spatial: bool
 ) -> Tunnel:
     """Return one tunnel, or the stack of several; arguments as for `resolve`."""
-    one = functools.partial(_single, lining=lining, piece=piece, reach=reach, spatial=spatial)
+    one = functools.partial(_single, lining=lining, stretch=stretch, reach=reach, spatial=spatial)
     if not all(isinstance(each, str) and in_benchmark(each) for each in sources):
         return stack([one(each) for each in sources])
     with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:  # most of the work is NumPy's
@@ -165,7 +165,7 @@ def _joined(
 
 
 def _single(
-    tunnel: Source, lining: str | None, piece: tuple[float, float] | None, reach: float, spatial: bool
+    tunnel: Source, lining: str | None, stretch: tuple[float, float] | None, reach: float, spatial: bool
 ) -> Tunnel:
     """Return the device tunnel of one source; arguments as for `resolve`."""
     if isinstance(tunnel, Tunnel):
@@ -175,25 +175,25 @@ def _single(
             raise ValueError("the tunnel was made for planar LiDARs alone: give its name, its file or its plan")
         return tunnel
     if isinstance(tunnel, TunnelPlan):
-        return _put(tunnel, lining, piece, reach, spatial)
+        return _put(tunnel, lining, stretch, reach, spatial)
     if not GENERATED.fullmatch(str(tunnel)):
-        put = lambda: _put(load_tunnel(tunnel), lining, piece, reach, spatial)  # noqa: E731
+        put = lambda: _put(load_tunnel(tunnel), lining, stretch, reach, spatial)  # noqa: E731
         file = Path(str(tunnel_file(tunnel)))  # a surface takes a quarter of a minute
-        return _kept(put, tunnel_digest(tunnel), lining, piece, reach) if spatial and file.is_file() else put()
+        return _kept(put, tunnel_digest(tunnel), lining, stretch, reach) if spatial and file.is_file() else put()
     # No more than is needed is made.
     name, lining = str(tunnel), lining or default_lining(str(tunnel))
-    make = lambda: _put(generate(name, (lining,), spatial), lining, piece, reach, spatial)  # noqa: E731
-    return _kept(make, name, lining, piece, reach, spatial) if in_benchmark(name) else make()
+    make = lambda: _put(generate(name, (lining,), spatial), lining, stretch, reach, spatial)  # noqa: E731
+    return _kept(make, name, lining, stretch, reach, spatial) if in_benchmark(name) else make()
 
 
 def _put(
-    plan: TunnelPlan, lining: str | None, piece: tuple[float, float] | None, reach: float, spatial: bool
+    plan: TunnelPlan, lining: str | None, stretch: tuple[float, float] | None, reach: float, spatial: bool
 ) -> Tunnel:
     """Put a plan on the device; arguments as for `resolve`."""
-    if piece is not None:
+    if stretch is not None:
         name = lining or plan.default_lining
         plan = dataclasses.replace(plan, linings={name: plan.lining(name)})  # no more than is needed is cut
-        start, length = piece
+        start, length = stretch
         plan = plan.slice(start, min(length, plan.length - start))
     planar = Tunnel.from_plan(plan, lining, reach=reach)
     if not spatial:
@@ -208,7 +208,7 @@ def _kept(make: Callable[[], Tunnel], *content: Any) -> Tunnel:
 
     Args:
         make: Makes the tunnel.
-        *content: All that the tunnel depends on beside the code: its name, lining, piece.
+        *content: All that the tunnel depends on beside the code: its name, lining, stretch.
     """
     folder = cache_folder("tunnels")
     if not make_writable(folder):

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from scene.survey.lidar import Lidar, Sweep
-from scene.survey.messages import CLOUD_TYPE, EPOCH, Convention, Recorder, encode, pieces_of
+from scene.survey.messages import CLOUD_TYPE, EPOCH, Convention, Recorder, chunks_of, encode
 
 RATE, RAYS = 10.0, 400
 OFFSET = np.rint(0.098e9 * np.arange(RAYS) / (RAYS - 1)).astype(np.int64)  # ns
@@ -29,6 +29,6 @@ def write_convention(path: Path, count: int = 12, point_times: str = "header", *
                 bag.start_part()
             begin = round((start - EPOCH) * 1e9)
             sweep = Sweep(k, begin, OFFSET, ~zero, points, zero.astype(np.uint8), zero)
-            for piece, lidar in pieces_of(sweep, LIDAR, convention):
-                bag.write("/points", begin + 100_000_000, encode(piece, lidar, convention))
+            for chunk, lidar in chunks_of(sweep, LIDAR, convention):
+                bag.write("/points", begin + 100_000_000, encode(chunk, lidar, convention))
     return bag.path

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from scene.writing.folder import write_geometry
-from scene.writing.furnished import FurnitureConfig, TunnelSpace, count_pieces, furnish_bore, planar_segments
+from scene.writing.furnished import FurnitureConfig, TunnelSpace, count_items, furnish_bore, planar_segments
 from scene.writing.mesh import as_trimesh, build_solid, has_rings, open_lining, split_skin
 from scene.writing.mjcf import SceneConfig, add_lights, concrete_picture
 from scene.writing.track import TrackConfig, lay_track
@@ -73,33 +73,33 @@ def test_brackets_stand_every_metre_with_an_arm_a_tier_and_one_door_at_half_the_
     ],
 )  # fmt: skip
 def test_pieces_have_their_sizes_and_lamps_hang_4_cm_under_the_crown(level, laid, kind, size):
-    pieces = [piece for piece in furnish_bore(level, laid, WITH_DOOR).pieces if piece.kind == kind]
-    for piece in pieces:
-        np.testing.assert_allclose(2 * piece.half, size, atol=0.02)
+    items = [item for item in furnish_bore(level, laid, WITH_DOOR).items if item.kind == kind]
+    for item in items:
+        np.testing.assert_allclose(2 * item.half, size, atol=0.02)
         if kind == "lamp":
-            under = level.toward(np.pi / 2)[0] - level.axis.local(piece.corners())[2].max()
+            under = level.toward(np.pi / 2)[0] - level.axis.local(item.corners())[2].max()
             assert under == pytest.approx(0.04, abs=2e-3)
-    assert pieces
+    assert items
 
 
 def test_every_kind_can_be_left_out(level, laid):
     kinds = {"walkway", "handrail", "cables", "third_rail", "plates", "passage", "lamps"}
     none = FurnitureConfig(**dict.fromkeys(kinds, False))
     nothing = furnish_bore(level, laid, none)
-    assert not nothing.pieces
+    assert not nothing.items
     assert not nothing.niches
-    assert not len(planar_segments(nothing.pieces, level, laid.elevation, 0.7))
+    assert not len(planar_segments(nothing.items, level, laid.elevation, 0.7))
     only_cables = furnish_bore(level, laid, replace(none, cables=True))
-    assert set(count_pieces(only_cables.pieces)) == {"bracket", "bracket_arm", "cable"}
+    assert set(count_items(only_cables.items)) == {"bracket", "bracket_arm", "cable"}
 
 
 def test_nothing_enters_the_robots_gauge(level, laid):
-    for piece in furnish_bore(level, laid, WITH_DOOR).pieces:
-        station, lateral, _ = level.axis.local(piece.corners())
-        low = piece.corners()[:, 2] - np.interp(station, level.station, laid.elevation)
+    for item in furnish_bore(level, laid, WITH_DOOR).items:
+        station, lateral, _ = level.axis.local(item.corners())
+        low = item.corners()[:, 2] - np.interp(station, level.station, laid.elevation)
         if low.min() < 2.0:
-            assert np.abs(lateral).min() > 0.9, piece.kind
-            assert (np.sign(lateral) == np.sign(lateral[0])).all(), piece.kind
+            assert np.abs(lateral).min() > 0.9, item.kind
+            assert (np.sign(lateral) == np.sign(lateral[0])).all(), item.kind
 
 
 def test_no_piece_is_without_size_where_the_wall_is_dented_at_an_arm(level, laid, monkeypatch):
@@ -110,15 +110,15 @@ def test_no_piece_is_without_size_where_the_wall_is_dented_at_an_arm(level, laid
         return (near - 0.4, far - 0.4) if side < 0 and abs(height - WITH_DOOR.tiers[1]) < 0.02 else (near, far)
 
     monkeypatch.setattr(TunnelSpace, "wall", dented)
-    pieces = furnish_bore(level, laid, WITH_DOOR).pieces
-    assert count_pieces(pieces)["bracket_arm"] == 4 * 24
-    assert min(piece.half.min() for piece in pieces) > 0.0
+    items = furnish_bore(level, laid, WITH_DOOR).items
+    assert count_items(items)["bracket_arm"] == 4 * 24
+    assert min(item.half.min() for item in items) > 0.0
 
 
 def test_walkway_and_third_rail_are_left_out_where_the_bore_is_too_narrow():
     narrow = arc_bore(half_width=1.7, radius=300.0)
     laid = lay_track(narrow, TrackConfig(shoulder=0.2))
-    kinds = count_pieces(furnish_bore(narrow, laid, FurnitureConfig()).pieces)
+    kinds = count_items(furnish_bore(narrow, laid, FurnitureConfig()).items)
     assert "walkway" not in kinds
     assert "handrail_post" not in kinds
     assert "bracket" in kinds

@@ -126,9 +126,9 @@ def judged_without(bore: Bore, hide) -> Judgement:
 
 def test_an_unseen_wall_is_named_with_its_side_and_its_stations(bore):
     judgement = judged_without(bore, lambda station, lateral, _: (lateral > 2.4) & (station > 8) & (station < 18))
-    piece = judgement.coverage.pieces[0]
-    assert (piece.start, piece.end) == (pytest.approx(8, abs=1.1), pytest.approx(18, abs=1.1))
-    assert piece.sides == "left wall"
+    patch = judgement.coverage.patches[0]
+    assert (patch.start, patch.end) == (pytest.approx(8, abs=1.1), pytest.approx(18, abs=1.1))
+    assert patch.sides == "left wall"
     assert [warning.code for warning in judgement.warnings] == ["unseen"]
     assert "left wall" in judgement.warnings[0].text
 
@@ -141,7 +141,7 @@ def test_an_unseen_floor_is_named(bore):
 def test_strays_do_not_count_as_having_seen_a_wall(bore):
     few = np.random.default_rng(2).random(60_000) < 0.01
     judgement = judged_without(bore, lambda station, *_: (station > 8) & (station < 18) & ~few)
-    assert judgement.coverage.pieces[0].sides == "all around"
+    assert judgement.coverage.patches[0].sides == "all around"
     assert judgement.coverage.fraction == pytest.approx(14 / 24, abs=0.08)
 
 

@@ -129,7 +129,7 @@ def test_sweeps_by_another_clock_stand_as_even_as_it_runs_however_late_their_hea
     np.testing.assert_allclose(np.diff([scan.stamp for scan in scans]), 0.1, atol=5e-4)
 
 
-@pytest.mark.parametrize("how", [{"point_times": "epoch", "point_unit": "ns"}, {"container": "mcap", "pieces": 2}])
+@pytest.mark.parametrize("how", [{"point_times": "epoch", "point_unit": "ns"}, {"container": "mcap", "chunks": 2}])
 def test_a_recording_is_written_anew_as_another_driver_has_it(tmp_path, how):
     whole = write_convention(tmp_path / "a.bag", point_times="boot", boot=320.0)
     convention = Convention(**{"point_times": "header", **how})

@@ -158,8 +158,8 @@ CONTAINERS = {
     "zstd by file of a db3": lambda folder: packed2(folder / "a", StoragePlugin.SQLITE3, CompressionMode.FILE),
     "a folder in a folder": nested,
     "a split recording without metadata": bare,
-    "a sweep in two messages": lambda folder: write_convention(folder / "a.bag", pieces=2),
-    "a sweep in ten messages": lambda folder: write_convention(folder / "a.bag", pieces=10, point_times="epoch"),
+    "a sweep in two messages": lambda folder: write_convention(folder / "a.bag", chunks=2),
+    "a sweep in ten messages": lambda folder: write_convention(folder / "a.bag", chunks=10, point_times="epoch"),
     "sweeps that never came": lambda folder: write_convention(folder / "a.bag", count=40, missing=0.2),
 }
 

@@ -22,13 +22,13 @@ NAMES = [None, *(f"open:{kind}:0" for kind in KINDS)]
 REACH = np.float32(CONTACT_REACH)
 
 
-def piece_of(name: str | None) -> st.TunnelPlan:
+def stretch_of(name: str | None) -> st.TunnelPlan:
     return (st.load_tunnel(name) if name else st.load_tunnel()).slice(100.0, 60.0)
 
 
 @pytest.fixture(scope="module")
 def plan() -> st.TunnelPlan:
-    return piece_of(None)
+    return stretch_of(None)
 
 
 nodes = jax.jit(jax.vmap(node_at, (None, 0)))  # eager code would compile every operation by itself
@@ -62,7 +62,7 @@ def test_scans_are_those_of_the_reference(plan: st.TunnelPlan, n_beams: int) -> 
 
 @pytest.mark.parametrize(("name", "lining"), [(NAMES[4], None), (NAMES[6], None), (None, "furnished")])
 def test_deep_recesses_rock_and_furniture_are_met(name: str | None, lining: str | None) -> None:
-    plan = piece_of(name)
+    plan = stretch_of(name)
     lining = lining or plan.default_lining
     poses = reference.random_poses(plan, 500, np.random.default_rng(1))
     found = reference.agreement(
@@ -139,7 +139,7 @@ def assert_equal(found: np.ndarray, truth: np.ndarray) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_clearances_are_those_of_xla_and_of_brute_force(name: str | None) -> None:
-    plan = piece_of(name)
+    plan = stretch_of(name)
     tunnel, lining = Tunnel.from_plan(plan), plan.default_lining
     position, station = places(plan, lining, 1)
     found, by_xla = both(tunnel, position, nodes(tunnel, station))

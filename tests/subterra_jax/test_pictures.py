@@ -7,7 +7,7 @@ from scipy.spatial import KDTree
 import subterra_jax as st
 from subterra_jax.host.texture import brightness, wall_angle
 from subterra_jax.pictures.camera import TunnelChoice
-from subterra_jax.pictures.stage import Piece, carrier_parts, stage_spec
+from subterra_jax.pictures.stage import Stretch, carrier_parts, stage_spec
 from subterra_jax.pictures.surfaces import short_shell, tunnel_surfaces
 from tests.subterra_jax.placing import draw
 
@@ -52,20 +52,20 @@ def test_a_plan_without_a_bore_has_upright_walls_seen_from_both_sides():
     assert len(faces) % 2 == 0
 
 
-def test_the_next_piece_is_made_before_the_robot_sees_the_end(plan):
-    piece = Piece.around(plan, None, 500.0)
-    assert (piece.start, piece.end) == (470.0, 570.0)
-    assert piece.shows(500.0)
-    assert piece.shows(529.0)
-    assert not piece.shows(531.0)
-    assert not piece.shows(500.0, -1.0)
-    assert Piece.around(plan, None, 500.0, -1.0).shows(500.0, -1.0)
-    assert Piece.around(plan, None, 3.0).shows(0.0)
-    assert Piece.around(plan, None, plan.length - 3.0).shows(plan.length)
+def test_the_next_stretch_is_made_before_the_robot_sees_the_end(plan):
+    stretch = Stretch.around(plan, None, 500.0)
+    assert (stretch.start, stretch.end) == (470.0, 570.0)
+    assert stretch.shows(500.0)
+    assert stretch.shows(529.0)
+    assert not stretch.shows(531.0)
+    assert not stretch.shows(500.0, -1.0)
+    assert Stretch.around(plan, None, 500.0, -1.0).shows(500.0, -1.0)
+    assert Stretch.around(plan, None, 3.0).shows(0.0)
+    assert Stretch.around(plan, None, plan.length - 3.0).shows(plan.length)
 
 
 def test_a_stage_is_for_looks_alone(plan):
-    model = stage_spec(Piece(plan, "pockets", 100.0, 110.0)).compile()
+    model = stage_spec(Stretch(plan, "pockets", 100.0, 110.0)).compile()
     assert not model.geom_contype.any()
     assert not model.geom_conaffinity.any()
     assert model.nbody == 1
@@ -74,7 +74,7 @@ def test_a_stage_is_for_looks_alone(plan):
 
 def test_the_walls_show_the_brightness_that_a_lidar_reads(plan):
     begin, end = 200.0, 206.0
-    model = stage_spec(Piece(plan, "smooth", begin, end, 1.0)).compile()
+    model = stage_spec(Stretch(plan, "smooth", begin, end, 1.0)).compile()
     own = model.tex("wall").id
     wide, high, first = (int(part[own]) for part in (model.tex_width, model.tex_height, model.tex_adr))
     pixels = model.tex_data[first : first + 3 * wide * high].reshape(high, wide, 3)[..., 0]
@@ -93,7 +93,7 @@ def test_the_walls_show_the_brightness_that_a_lidar_reads(plan):
 
 
 def test_each_tunnel_of_a_list_is_drawn_by_its_number(plan):
-    choice = TunnelChoice([plan, "control"], piece=(10.0, 60.0))
+    choice = TunnelChoice([plan, "control"], stretch=(10.0, 60.0))
     assert choice.plan(0).name == "metro"
     assert choice.plan(1).length == pytest.approx(60.0)
     assert TunnelChoice("open:val:0-2").plan(1).name == st.load_tunnel("open:val:1").name

@@ -85,7 +85,7 @@ def test_the_control_tunnel_has_one_curvature_one_width_and_no_landmark():
     np.testing.assert_allclose(seen, np.broadcast_to(seen.mean(axis=0), seen.shape), atol=0.02)
 
 
-def test_a_range_of_names_and_a_list_of_them_are_one_stack_cut_to_the_piece_of_a_task():
+def test_a_range_of_names_and_a_list_of_them_are_one_stack_cut_to_the_stretch_of_a_task():
     ranged = resolve("open:val:2-4", "smooth", (0.0, 60.0), 30.0)
     listed = resolve([f"open:val:{i}" for i in (2, 3, 4)], "smooth", (0.0, 60.0), 30.0)
     assert ranged.count == 3
@@ -126,7 +126,7 @@ def test_a_tunnel_is_made_once_and_then_read(tmp_path, monkeypatch):
     for one, other in zip(jax.tree.leaves(first), jax.tree.leaves(again), strict=True):
         np.testing.assert_array_equal(one, other)
         assert isinstance(other, jax.Array)
-    afresh(length=61.0)  # another piece is another tunnel
+    afresh(length=61.0)  # another stretch is another tunnel
     monkeypatch.setattr(sources, "_code", lambda: "other code")
     afresh()
     assert len(made) == 3

@@ -95,7 +95,7 @@ def test_walls_stand_where_the_lining_has_them_and_are_seen_from_within(centreli
     assert not floor.vertices[:, 2].any()
 
 
-def test_rails_and_sleepers_of_a_piece_are_drawn(centreline):
+def test_rails_and_sleepers_of_a_stretch_are_drawn(centreline):
     *_, rail, sleeper = planar_shapes(st.load_tunnel("subterra-351").slice(100.0, 60.0), "pockets")
     assert (rail.name, sleeper.name, len(sleeper.faces) // 12) == ("rail", "sleeper", 100)
 

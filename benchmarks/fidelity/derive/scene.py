@@ -135,7 +135,7 @@ _SEAT_REACH = 0.20  # m between parts of the fastening of one seat
 def count_assets(case: Case) -> dict[str, int]:
     """Counts assets of the compiled scene by the names of the manifest; a fastener is a clip with its shoulder."""
     names = scene_geoms(case).names
-    middle, height = fastening_pieces(track_of(scene_geoms(case)).fastening_mesh)
+    middle, height = fastening_parts(track_of(scene_geoms(case)).fastening_mesh)
     pad = height <= _PAD_HEIGHT
     return {
         "sleepers": sum(name.startswith("sleeper_") for name in names),
@@ -147,7 +147,7 @@ def count_assets(case: Case) -> dict[str, int]:
     }
 
 
-def fastening_pieces(mesh: trimesh.Trimesh) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, " k"]]:
+def fastening_parts(mesh: trimesh.Trimesh) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, " k"]]:
     """Return the middle and the vertical extent of each connected piece, m."""
     if not len(mesh.faces):
         return np.zeros((0, 3)), np.zeros(0)
@@ -162,7 +162,7 @@ def fastening_pieces(mesh: trimesh.Trimesh) -> tuple[Float[np.ndarray, "k 3"], F
 @per_case
 def fastening_sets(case: Case) -> Float[np.ndarray, "k 3"]:
     """Return the middle of each fastening, that is, of the pieces that lie together, m."""
-    return cluster_points(fastening_pieces(case.candidate.track.fastening_mesh)[0], _SEAT_REACH)
+    return cluster_points(fastening_parts(case.candidate.track.fastening_mesh)[0], _SEAT_REACH)
 
 
 def cluster_points(middle: Float[np.ndarray, "p 3"], reach: float) -> Float[np.ndarray, "k 3"]:

@@ -1,7 +1,5 @@
 """A robot whose own LiDAR sees in three dimensions, as a recording."""
 
-import shutil
-
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
@@ -20,7 +18,7 @@ from subterra_jax.tunnel.sources import tunnel_file
 @pytest.fixture(scope="module")
 def config(tmp_path_factory):
     scene = tmp_path_factory.mktemp("spatial")
-    shutil.copy(str(tunnel_file("subterra-351")), scene / "tunnel.npz")
+    (scene / "tunnel.npz").symlink_to(str(tunnel_file("subterra-351")))
     config = RecorderConfig(
         out=scene / "o", task="TraverseShort", scene=scene, lining="smooth", sensor="spin16x64", steps=4, every=2
     )
