@@ -216,7 +216,7 @@ def project_station(point: Float[np.ndarray, "3"], truth: Truth) -> float:
 
 
 CLOSE = 0.03  # m: sizes and the mean distance of walls may be off by this
-NEAR_SHARE = 0.97  # of the wall points must be met within 10 cm
+NEAR_FRACTION = 0.97  # of the wall points must be met within 10 cm
 COVERED = 0.97  # of the judged span must be built
 SLEEPER_F1 = 0.9
 _SLACK = 2.0  # m between the stretch of a warning and a fault
@@ -248,7 +248,7 @@ def list_faults(row: dict[str, Any]) -> list[Fault]:
     faults = []
     if row.get("wall_mean", 0.0) > CLOSE:
         faults.append(Fault("walls", f"walls {100 * row['wall_mean']:.1f} cm in the mean"))
-    if row.get("wall_near", 1.0) < NEAR_SHARE:
+    if row.get("wall_near", 1.0) < NEAR_FRACTION:
         faults.append(Fault("walls", f"{100 * row['wall_near']:.1f} % within 10 cm"))
     for name in ("width", "height", "floor", "aside"):
         if abs(row[f"{name}_worst"]) > CLOSE:

@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
-_LINE_EVERY, _LINE_SHARE = 10.0, 0.1  # s, and fraction of a stage, between two lines where there is no terminal
+_LINE_EVERY, _LINE_FRACTION = 10.0, 0.1  # s, and fraction of a stage, between two lines where there is no terminal
 
 
 class _Rate(ProgressColumn):
@@ -57,7 +57,7 @@ class Stage:
         """Prints one line for each tenth of a stage that lasts."""
         now = time.monotonic()
         steps = self.done - self._line_done
-        if now - self._line_at < _LINE_EVERY or steps < _LINE_SHARE * (self.total or 0) or self.done == self.total:
+        if now - self._line_at < _LINE_EVERY or steps < _LINE_FRACTION * (self.total or 0) or self.done == self.total:
             return
         self._line_at, self._line_done = now, self.done
         rate = (self.done - self._first) / (now - self._started)

@@ -65,11 +65,11 @@ TROLLEY_LENGTH, TROLLEY_WIDTH = 2.4, 1.2  # m
 # Faults of T4 at the highest severity. Each size is drawn for an episode between 1 - spread and 1 + spread times its
 # middle, given here.
 SEVERITY_LOW, SEVERITY_HIGH = 0, 4
-DROPOUT_RATE, DROPOUT_SHARE, DROPOUT_STEPS = 0.02, 0.5, 40.0  # per step, of the beams, steps
+DROPOUT_RATE, DROPOUT_FRACTION, DROPOUT_STEPS = 0.02, 0.5, 40.0  # per step, of the beams, steps
 DUST_RATE = 0.15  # per beam
 FREEZE_RATE, FREEZE_STEPS = 0.01, 30.0  # per step, steps
 DELAY = 2.4  # steps
-WET_PATCH, WET_SHARE, WET_LOSS = 10.0, 0.3, 0.3  # m, of the patches, of the speed
+WET_PATCH, WET_FRACTION, WET_LOSS = 10.0, 0.3, 0.3  # m, of the patches, of the speed
 FAULT_SPREAD = 2.0 / 3.0
 # Odometers do not begin at 0 in T4, or the first reading would tell the delay.
 ORIGIN_DISTANCE_SIGMA, ORIGIN_HEADING_SIGMA = 0.05, 0.005  # m, rad

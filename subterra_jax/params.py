@@ -1,7 +1,7 @@
 """Params of an environment: gathered from its motion, parts and rule, made arrays, and checked; and their digest.
 
-Every number enters the digest under a key, its dotted path at the time when the key was made. Class names do not enter.
-Whoever renames a part or a field gives the old key in `RENAMED`: the tests list every key and its value.
+Every number enters the digest under its dotted path; class names do not enter. Whoever renames a part or a field makes
+another digest, and writes it into released policies and cells: the tests list every key and its value.
 """
 
 from __future__ import annotations
@@ -119,28 +119,15 @@ def check_length(env: TunnelEnv, params: EnvParams) -> None:
         raise ValueError(f"{env.id} needs a tunnel of {needed:g} m, this one has {shortest:.1f} m")
 
 
-RENAMED = {"reported": "told"}  # beginning of a path today: what its keys begin with
-
-
 def task_figures(env: TunnelEnv, params: EnvParams) -> dict[str, Any]:
-    """Return the numbers of a task by key, whatever its tunnel, and the keys of rule and parts."""
+    """Return the numbers of a task by path, whatever its tunnel, the key of its rule, and the names of its parts."""
     leaves = jax.tree_util.tree_flatten_with_path({"horizon": params.horizon, **params.parts})[0]
     return {
         "rule": env.rule.key,
-        "parts": [key_of(part.name) for part in (env.motion, *env.parts)],
+        "parts": [part.name for part in (env.motion, *env.parts)],
         "beams": params.lidar.n_beams,
-        "numbers": {
-            key_of(jax.tree_util.keystr(path, simple=True, separator=".")): plain(leaf) for path, leaf in leaves
-        },
+        "numbers": {jax.tree_util.keystr(path, simple=True, separator="."): plain(leaf) for path, leaf in leaves},
     }
-
-
-def key_of(path: str) -> str:
-    """Return the key of a dotted path."""
-    for begin, key in RENAMED.items():
-        if path == begin or path.startswith(f"{begin}."):
-            return key + path.removeprefix(begin)
-    return path
 
 
 def plain(leaf: Any) -> Any:

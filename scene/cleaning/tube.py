@@ -271,7 +271,7 @@ _STRIP = (0.08, 0.50)  # m below the ceiling, where a wall is looked for
 _SIDEWAYS = 0.95  # cosine of directions across
 _ROW = 1.0  # m of bore
 _APART = 0.1  # m between places on a wall
-_LAYER, _LEAST, _LEAST_SHARE = 0.06, 3, 0.04  # m, points, and fraction of a row's: fewer in so thin a layer are strays
+_LAYER, _LEAST, _LEAST_FRACTION = 0.06, 3, 0.04  # m, points, part of a row's: fewer in so thin a layer are strays
 _NEXT = 3  # rows: in one of so many the wall shows beside or above things
 _ALONG = 15  # rows in whose median a wall stays where it is
 _BEFORE, _SOME = 0.3, 0.03  # m before a wall, and fraction of the returns there, that things stand along it
@@ -370,7 +370,7 @@ def _outermost_layer(
     for k in range(count):
         own = np.sort(out[order[bounds[k] : bounds[k + 1]]])
         layer = np.arange(1, len(own) + 1) - np.searchsorted(own, own - _LAYER)
-        walls = np.flatnonzero(layer >= max(_LEAST, _LEAST_SHARE * len(own)))
+        walls = np.flatnonzero(layer >= max(_LEAST, _LEAST_FRACTION * len(own)))
         if len(walls):
             furthest[k] = np.median(own[walls[-1] + 1 - layer[walls[-1]] : walls[-1] + 1])
     known = np.isfinite(furthest) & (furthest > 0)

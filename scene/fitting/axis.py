@@ -16,7 +16,7 @@ from scene.fitting.floor import fit_floor_line, floor_radius
 from scene.geometry import Axis, measure_section
 
 _OVERRUN = 6.0  # m beyond the axis that are looked at
-_THIN_SHARE, _THIN = 0.05, 20  # of the usual number of points, and points: a section that is hardly seen has fewer
+_THIN_FRACTION, _THIN = 0.05, 20  # of the usual number of points, and points: a section that is hardly seen has fewer
 _UNUSUAL, _ROUGH = 0.3, 6.0  # m from the usual section, and standard deviations of the wall about it
 _SPACING = 1.0  # m between sections
 _PASSES = 4  # times that the axis is pulled to the middle
@@ -73,7 +73,7 @@ def section_middles(
     bounds = np.searchsorted(index[order], np.arange(len(extended.station) + 1))
     count = np.diff(bounds)
     # Far from the last tripod a bore is thin, but goes on.
-    enough = np.flatnonzero(count >= max(_THIN_SHARE * float(np.median(count[count > 0])), _THIN))
+    enough = np.flatnonzero(count >= max(_THIN_FRACTION * float(np.median(count[count > 0])), _THIN))
     if not len(enough):
         why = "no tunnel in the cloud: none of its returns lies on the wall of the way that was followed"
         raise FitError(why, Refusal.NO_BORE)

@@ -31,7 +31,7 @@ MODES = ("nearest", "wrap")
 _PROFILE = 0.30  # half window for the common size, m
 _SIDE = 0.5  # weight of a return behind the wall against a missing one on it
 _OVERSHOOT = 0.7  # of the wall's spread: how far the deepest of a few returns lies beyond the surface, measured
-_DEEP_SHARE = 0.75  # quantile over pockets of their deepest return
+_DEEP_FRACTION = 0.75  # quantile over pockets of their deepest return
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ def _spread(profile: Float[np.ndarray, " k"]) -> float:
 def common_depth(sections: Sections, holes: Holes, slope: np.ndarray) -> float:
     """Depth of the mould, m, from the pockets whose backs are seen, less the noise of the deepest return."""
     deepest = patches(sections.deepest, holes, 4, 2).max(axis=(1, 2)) * slope
-    return float(np.quantile(deepest, _DEEP_SHARE) - _OVERSHOOT * np.median(sections.spread))
+    return float(np.quantile(deepest, _DEEP_FRACTION) - _OVERSHOOT * np.median(sections.spread))
 
 
 _BEYOND_RIM = 2  # cells beyond the edge of a hole in which the wall must stand again

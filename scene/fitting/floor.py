@@ -14,7 +14,7 @@ _GATES = ((-0.15, 0.10), (-0.08, 0.05), (-0.05, 0.04), (-0.04, 0.04))
 _START_PERCENTILE = 20  # of the heights of the lower half, where a line begins
 _CLUTTER = 0.45  # m above the floor that track and people explain
 _MIN_POINTS = 30  # points of a line
-_FLAT_SHARE = 0.85  # of the bottom that a line explains
+_FLAT_FRACTION = 0.85  # of the bottom that a line explains
 _INNER = 0.75  # of the half width: further out are corners
 _BESIDE = 0.5  # of the half width: further in is track
 
@@ -42,7 +42,7 @@ def fit_floor_line(lateral: Float[np.ndarray, " n"], upward: Float[np.ndarray, "
     residual = z - line[0] - line[1] * y
     explained = (np.abs(residual) < 0.06) | ((residual > 0) & (residual < _CLUTTER))
     support = (np.abs(residual) < 0.06).mean()
-    return line if explained.mean() > _FLAT_SHARE and support > 0.3 else None
+    return line if explained.mean() > _FLAT_FRACTION and support > 0.3 else None
 
 
 _PEAK = (-0.08, 0.08)  # m about a line, in which the height is sought that most points have
@@ -69,7 +69,7 @@ _STRIPS = 24  # that the width between the walls is divided into
 _OUT = 0.97  # of the half width
 _LAYER = 0.02  # m
 _SLOPES = np.linspace(-0.06, 0.06, 7)
-_LEAST_SHARE = 0.1  # of the returns of a strip of floor, in a strip that shows it
+_LEAST_FRACTION = 0.1  # of the returns of a strip of floor, in a strip that shows it
 _LEAST_EXTENT, _MOST_DEEPER = 0.15, 0.2  # of the strips, shown on the floor and below it: a drain is narrower
 _BESIDE_PLATFORM, _FLOOR_BESIDE = 0.6, 0.35  # of the strips, near the floor and on it, where a platform stands on it
 _LOWER = 0.05  # m that a lower floor lies below the first line
@@ -98,7 +98,7 @@ def find_lower_line(
     line = _refine_line(layer.line, y, z, half_width, 0.0 if above is None else above[1])
     inner = layer.bottoms[np.abs(np.arange(_STRIPS) - (_STRIPS - 1) / 2) < _INNER * _STRIPS / 2]
     clutter = float(((inner > -0.06) & (inner < _CLUTTER)).mean())
-    flat = clutter > _FLAT_SHARE or (clutter > _BESIDE_PLATFORM and layer.extent > _FLOOR_BESIDE)
+    flat = clutter > _FLAT_FRACTION or (clutter > _BESIDE_PLATFORM and layer.extent > _FLOOR_BESIDE)
     return line if flat and line is not None and line[0] < highest else None
 
 
@@ -124,7 +124,7 @@ def _best_layer(
     thick = count.copy()  # three layers
     thick[:, 1:] += count[:, :-1]
     thick[:, :-1] += count[:, 1:]
-    shown = thick >= max(2.0, _LEAST_SHARE * float(np.median(thick.max(axis=1))))
+    shown = thick >= max(2.0, _LEAST_FRACTION * float(np.median(thick.max(axis=1))))
     bottom = np.where(shown.any(axis=1), np.argmax(shown, axis=1), layers)
     lowest = np.bincount(bottom, minlength=layers + 1)[:layers] / _STRIPS
     extent = np.convolve(lowest, np.ones(3), mode="same")
@@ -233,7 +233,7 @@ def find_floors(
 
 
 _ENOUGH, _LONGEST_WINDOW = 1000, 4.0  # points that show a floor beside sleepers; m
-_MIDDLE, _PIT, _PIT_SHARE = 1.2, 0.5, 0.05  # m beside the axis; m below its floor; fraction of the returns that low
+_MIDDLE, _PIT, _PIT_FRACTION = 1.2, 0.5, 0.05  # m beside the axis; m below its floor; fraction of the returns that low
 
 
 def _lines_beside_pit(lateral: np.ndarray, upward: np.ndarray) -> list[tuple[float, float]]:
@@ -243,7 +243,7 @@ def _lines_beside_pit(lateral: np.ndarray, upward: np.ndarray) -> list[tuple[flo
     if line is None:
         return []
     deep = upward < line[0] + line[1] * lateral - _PIT
-    return [line] if deep.mean() > _PIT_SHARE else []
+    return [line] if deep.mean() > _PIT_FRACTION else []
 
 
 _GAP = 4  # sections without a floor beyond which it runs on by itself, not beside the axis

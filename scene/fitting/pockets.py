@@ -17,7 +17,7 @@ from scene.fitting.evidence import CLEAR, MIN_DEPTH, MODES, Holes
 from scene.fitting.section import Sections
 from scene.fitting.unroll import Grid
 
-_ROW_SHARE = 0.3  # of the fullest row, and of the places in a row
+_ROW_FRACTION = 0.3  # of the fullest row, and of the places in a row
 _PITCHES = (0.9, 2.1)  # widths of rings in use, m
 _MIN_COHERENCE = 0.4  # length of the mean wave of a pitch: 0 by chance, 1 at one place of each ring
 _NEAR_PLACE = 0.12  # m along the bore
@@ -30,7 +30,7 @@ def keep_rows(holes: Holes, columns: int, reach: float) -> Holes:
     window = max(int(2 * reach) | 1, 3)
     filled = uniform_filter(clear, window, mode="wrap") * window
     fullest = maximum_filter(filled, 2 * window + 1, mode="wrap")
-    peaks = np.flatnonzero((filled == fullest) & (filled > max(_ROW_SHARE * filled.max(), 2)))
+    peaks = np.flatnonzero((filled == fullest) & (filled > max(_ROW_FRACTION * filled.max(), 2)))
     return holes.where(_near_columns(holes, peaks, columns, reach))
 
 
@@ -53,7 +53,7 @@ def add_pattern(faint: Holes, clear: Holes, grid: Grid, reach: float) -> Holes:
     places = 2 * len(joints)
     peaks = np.flatnonzero(
         (filled == maximum_filter(filled, 2 * window + 1, mode="wrap"))
-        & (filled * window > 2 * _ROW_SHARE * places)
+        & (filled * window > 2 * _ROW_FRACTION * places)
         & (filled > 0.6 * everything)
     )
     more = in_place.where(_near_columns(in_place, peaks, grid.columns, reach))
@@ -70,7 +70,8 @@ def _stand_in_places(
     bins = max(round(pitch / _PLACES), 4)
     known = np.bincount(((station - joint) % pitch / pitch * bins).astype(int) % bins, minlength=bins).astype(float)
     spread = uniform_filter(known, 3, mode="wrap")
-    places = np.flatnonzero((spread == maximum_filter(spread, 5, mode="wrap")) & (spread > _ROW_SHARE * spread.max()))
+    top = maximum_filter(spread, 5, mode="wrap")
+    places = np.flatnonzero((spread == top) & (spread > _ROW_FRACTION * spread.max()))
     at = ((holes.row + 0.5) * step - joint) % pitch
     apart = np.abs(at[:, None] - (places[None] + 0.5) * pitch / bins)
     return np.minimum(apart, pitch - apart).min(axis=1) < _NEAR_PLACE
@@ -105,7 +106,7 @@ FLOOR_MARGIN = 0.45  # m above the floor
 _ROW_WIDTH = 0.15  # m
 _MIN_POCKETS = 6  # with fewer there is no lining
 _MIN_SEEN = 0.6  # of the wall
-_NOISE_SHARE = 0.25  # of the depth
+_NOISE_FRACTION = 0.25  # of the depth
 _RIB = 0.02  # least wall left between two pockets, and before a mouth, m
 _OPEN_RIM, _USUAL_RIM = 0.35, 0.15  # part of the wall missing around one hole that is no pocket, and around the usual
 
@@ -195,7 +196,7 @@ def could_show_pockets(sections: Sections, depth: float) -> bool:
     near = uniform_filter(sections.support, _EXPECTED, mode=MODES)[~_near_floor(sections)]
     seen = float(np.mean(near > _MIN_EXPECTED)) if near.size else 0.0
     noise = float(np.median(sections.spread))
-    return seen > _MIN_SEEN and noise < _NOISE_SHARE * depth
+    return seen > _MIN_SEEN and noise < _NOISE_FRACTION * depth
 
 
 def _near_floor(sections: Sections) -> np.ndarray:

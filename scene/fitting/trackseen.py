@@ -23,7 +23,7 @@ _LOW_TOP = 0.10  # tops up to here stand out of ballast that lies even, m
 _TOPMOST = 0.45  # above the floor, m
 _RAIL_LEAST = 0.09  # from the top of a sleeper to that of the rail, m
 _LEVEL_BIN = 0.01  # m of height
-_LAYER_SHARE = 0.3  # of the returns of the fullest layer
+_LAYER_FRACTION = 0.3  # of the returns of the fullest layer
 _WALL = 0.25  # m
 _ASIDE = 0.05  # m
 _FOOT = 0.15  # from the middle of a rail, m
@@ -109,7 +109,7 @@ def _top_level(height: np.ndarray, rail_top: float | None) -> float:
     if not count.sum():
         return 0.0
     near = np.convolve(count, np.ones(2), mode="same")
-    layers = np.flatnonzero(near >= _LAYER_SHARE * near.max())
+    layers = np.flatnonzero(near >= _LAYER_FRACTION * near.max())
     top = int(layers[-1])
     top -= int(np.argmax(near[max(top - 2, 0) : top + 1][::-1]))
     return float(edges[top])

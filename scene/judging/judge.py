@@ -122,7 +122,7 @@ def judge_bore(
     inside = float(returns.weight[returns.in_span].sum())
     worst = _worst_windows(bore, returns)
     warnings = [
-        *_warn_of_share(returns, cause, places, worst, config),
+        *_warn_of_fraction(returns, cause, places, worst, config),
         *(Warned(Code.CUT, part.warning, part.start, part.end) for part in removed if part.warning),
         *_warn_of_ends(bore, returns),
         *_warn_of_unseen(coverage),
@@ -132,7 +132,7 @@ def judge_bore(
     return Judgement(config.tolerance, tuple(warnings), returns, coverage, places, scattered, worst)
 
 
-def _warn_of_share(
+def _warn_of_fraction(
     returns: Returns,
     cause: np.ndarray | None,
     places: tuple[Place, ...],

@@ -51,8 +51,8 @@ POCKET_WIDTH = 0.18  # m, along the girth
 NAIL_DIAMETER = 0.028  # m
 NAIL_DEPTH = 0.06  # m, axis of the nail behind the lining surface
 POCKET_DEPTH_SIGMA = 0.01  # m, from pocket to pocket
-FILLED_SHARE = 0.05  # pockets missing: mortared flush
-NAIL_MISSING_SHARE = 0.03
+FILLED_FRACTION = 0.05  # pockets missing: mortared flush
+NAIL_MISSING_FRACTION = 0.03
 
 SLEEPER_JITTER = 0.01  # m, standard deviation of each sleeper's station
 SLEEPER_BOTTOM = 0.30  # m, along the track
@@ -123,8 +123,8 @@ def draw_furniture(rng: np.random.Generator, length: float, rings: bool = True, 
     sleepers = sleepers + SLEEPER_JITTER * np.clip(rng.standard_normal(len(sleepers)), -3.0, 3.0)
     reach = sizes.pocket_offset + 0.5 * sizes.pocket_length + 0.05
     pocketed = (joints > reach) & (joints < length - reach)
-    filled = rng.random((len(joints), N_ROWS, 2)) < FILLED_SHARE
+    filled = rng.random((len(joints), N_ROWS, 2)) < FILLED_FRACTION
     depth = sizes.pocket_depth + POCKET_DEPTH_SIGMA * np.clip(rng.standard_normal(filled.shape), -3.0, 3.0)
     depth += np.asarray(sizes.row_depth)[None, :, None]
-    nails = (rng.random((len(joints), N_ROWS)) >= NAIL_MISSING_SHARE) & ~filled.any(axis=2)
+    nails = (rng.random((len(joints), N_ROWS)) >= NAIL_MISSING_FRACTION) & ~filled.any(axis=2)
     return Furniture(joints, pocketed, filled, depth, nails & pocketed[:, None], sleepers, sizes=sizes)

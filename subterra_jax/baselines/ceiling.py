@@ -39,7 +39,7 @@ def ceiling(params: EnvParams, n_particles: int | None = None) -> Navigator:
     made = ParticleLocaliser.of(params, n_particles or 512 * (2 if faulted else 1) * (2 if hidden else 1))
     motion = commanded_cloud(params)
     if not hidden or faulted:
-        motion = dataclasses.replace(motion, least_share=_DENSE_LEAST, ess_share=_DENSE_DUE)
+        motion = dataclasses.replace(motion, least_fraction=_DENSE_LEAST, ess_fraction=_DENSE_DUE)
     scan = ScanModel(range_sigma=range_sigma(params))
     localiser = dataclasses.replace(made, scan=scan, motion=motion, exact=ExactParams(), privileged=True)
     return Navigator(localiser, steering_of(params, CentreLine()), name=NAME, uses_map=True)

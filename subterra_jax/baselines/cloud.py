@@ -8,7 +8,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from subterra_jax.baselines.reckoning import command_errors, odometer_errors, odometer_share
+from subterra_jax.baselines.reckoning import command_errors, odometer_errors, odometer_fraction
 from subterra_jax.baselines.scanmodel import TunnelPose, move_pose
 from subterra_jax.baselines.stations import fault_sizes
 from subterra_jax.baselines.wallmap import WallMap
@@ -49,10 +49,10 @@ class CloudParams:
     # rate at which a particle changes between dry and wet rail, 1/m; 0 is never
     slip_rate: float | Float[Array, ""] = 0.0
     slip_loss: float | Float[Array, ""] = 0.3  # fraction of the speed lost on wet rail, 1
-    ess_share: float = 0.5  # the cloud is resampled when its effective size falls below this fraction
+    ess_fraction: float = 0.5  # the cloud is resampled when its effective size falls below this fraction
     # Share to which one scan may reduce the effective size. A likelihood that would reduce it further is flattened, so
     # that chance does not select a few particles of a sparse cloud.
-    least_share: float = 0.5
+    least_fraction: float = 0.5
     roughening: float = 0.0005  # standard deviation of the noise on the lasting scale error of a resampled particle, 1
     jitter: float = 0.2  # standard deviation of the noise on its station, in lengths of the cloud over its particles
     cluster: float = 0.6  # half the length of one cluster, m: half the shortest distance at which a wall repeats
@@ -82,7 +82,7 @@ def commanded_cloud(params: EnvParams) -> CloudParams:
 
 def cloud_params(params: EnvParams) -> CloudParams:
     """Return the motion of a cloud for the nominal errors of a task; on the host."""
-    fraction = odometer_share(params)
+    fraction = odometer_fraction(params)
     (lasting, changing), (plant_lasting, plant_changing) = odometer_errors(params), command_errors(params)
     fused = lambda a, b: float(np.hypot(fraction * a, (1.0 - fraction) * b))  # noqa: E731
     wander = params.slip.wander if "slip" in params.parts else params.odometry.wander
@@ -178,7 +178,7 @@ def weigh_odometer(
 def reweight(cloud: Cloud, gain: Float[Array, "n"], params: CloudParams) -> Cloud:
     """Multiplies the weights by a likelihood, flattened where it would leave too few particles; `gain` is its log."""
     options = _normalise(cloud.log_weight + jnp.asarray(_POWERS)[:, None] * gain)
-    enough = _effective_size(options) >= params.least_share * gain.shape[0]
+    enough = _effective_size(options) >= params.least_fraction * gain.shape[0]
     # The largest power that leaves enough particles, or else the least.
     chosen = jnp.where(jnp.any(enough), jnp.argmax(enough), len(_POWERS) - 1)
     return dataclasses.replace(cloud, log_weight=options[chosen])
@@ -200,7 +200,7 @@ def resample(key: PRNGKeyArray, cloud: Cloud, params: CloudParams) -> Cloud:
     """
     n = cloud.scale.shape[0]
     weight = jnp.exp(cloud.log_weight)
-    due = _effective_size(cloud.log_weight) < params.ess_share * n
+    due = _effective_size(cloud.log_weight) < params.ess_fraction * n
     offset_key, rough_key = jax.random.split(key)
     total = jnp.cumsum(weight)
     point = (jnp.arange(n) + jax.random.uniform(offset_key)) / n * total[-1]

@@ -20,7 +20,7 @@ from subterra_jax.baselines.agent import Known, Observed, range_sigma
 from subterra_jax.baselines.cloud import CloudParams, cloud_params
 from subterra_jax.baselines.exactscan import ExactParams, exact_likelihood
 from subterra_jax.baselines.navigator import Navigator
-from subterra_jax.baselines.reckoning import Reckoning, begin_reckoning, odometer_share, reckon, unobserved_distance
+from subterra_jax.baselines.reckoning import Reckoning, begin_reckoning, odometer_fraction, reckon, unobserved_distance
 from subterra_jax.baselines.scanmodel import ScanModel, TunnelPose, fit, fit_roughly, move_pose
 from subterra_jax.baselines.stations import Driven, Localiser, Station, reported_start
 from subterra_jax.baselines.steering import CentreLine, steering_of
@@ -90,7 +90,7 @@ class HistogramLocaliser(Localiser):
     walls: WallMap  # the map, for offset and heading of each cell
     noise: CloudParams  # errors of dead reckoning
     scan: ScanModel  # errors of the LiDAR, for offset and heading
-    odometer_share: float  # weight of the odometer against the command
+    odometer_fraction: float  # weight of the odometer against the command
     exact: ExactParams  # settings of the likelihood
     n_cells: int = struct.field(pytree_node=False, default=0)  # cells of the tape
     cell: float = struct.field(pytree_node=False, default=CELL)  # length of a cell, m
@@ -103,7 +103,7 @@ class HistogramLocaliser(Localiser):
             walls=wall_map(params.tunnel),
             noise=cloud_params(params),
             scan=ScanModel(range_sigma=range_sigma(params)),
-            odometer_share=odometer_share(params),
+            odometer_fraction=odometer_fraction(params),
             exact=exact or ExactParams(),
             n_cells=int(np.ceil(span / cell)),
             cell=cell,
@@ -128,7 +128,7 @@ class HistogramLocaliser(Localiser):
     ) -> tuple[Station, HistogramMemory]:
         walls, period = self.walls.pick(params.tunnel), jnp.asarray(params.vehicle.period)
         range_max = jnp.asarray(params.lidar.range_max)
-        distance, turn, reckoning = reckon(memory.reckoning, obs, driven.speed, self.odometer_share, period)
+        distance, turn, reckoning = reckon(memory.reckoning, obs, driven.speed, self.odometer_fraction, period)
         along = distance * self._cosine(memory)
         mass = self._slide(jnp.exp(memory.log_mass), along)
         way = memory.way + along

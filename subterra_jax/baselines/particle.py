@@ -26,7 +26,7 @@ from subterra_jax.baselines.reckoning import (
     Reckoning,
     begin_reckoning,
     known_delay,
-    odometer_share,
+    odometer_fraction,
     reckon,
     unobserved_distance,
 )
@@ -58,7 +58,7 @@ class ParticleLocaliser(Localiser):
     walls: WallMap  # the map
     motion: CloudParams  # motion of the cloud
     scan: ScanModel  # assumed errors of the LiDAR
-    odometer_share: float | Float[Array, ""]  # weight of the odometer against the command
+    odometer_fraction: float | Float[Array, ""]  # weight of the odometer against the command
     # settings of the likelihood of scans that every particle casts in the true walls; None compares the ends of beams
     # with the map
     exact: ExactParams | None = None
@@ -74,7 +74,7 @@ class ParticleLocaliser(Localiser):
             walls=wall_map(params.tunnel),
             motion=cloud_params(params),
             scan=ScanModel(range_sigma=range_sigma(params)),
-            odometer_share=odometer_share(params),
+            odometer_fraction=odometer_fraction(params),
             n_particles=n_particles,
         )
 
@@ -112,7 +112,7 @@ class ParticleLocaliser(Localiser):
         apart = motion.odometer is not None
         before = known_delay(memory.reckoning, params, known)
         # The odometer's noise of each step would otherwise be noise of the motion: it is weighed apart.
-        distance, turn, reckoning = reckon(before, obs, driven.speed, 0.0 if apart else self.odometer_share, period)
+        distance, turn, reckoning = reckon(before, obs, driven.speed, 0.0 if apart else self.odometer_fraction, period)
         heard: Array | float = 0.0
         if apart:
             read = obs.distance - memory.reckoning.distance

@@ -16,7 +16,7 @@ from subterra_jax.parts.faults import MAX_DELAY, N_SEVERITIES
 from subterra_jax.parts.unicycle import wrap
 from subterra_jax.state import EnvParams
 
-_LEAST_COMMAND, _STILL_SHARE = 0.03, 0.5  # m, 1; half of a step is five standard deviations at full speed
+_LEAST_COMMAND, _STILL_FRACTION = 0.03, 0.5  # m, 1; half of a step is five standard deviations at full speed
 
 
 @struct.dataclass
@@ -39,7 +39,7 @@ def reckon(
     before: Reckoning,
     obs: Observed,
     speed: Float[Array, ""],
-    odometer_share: Float[Array, ""] | float,
+    odometer_fraction: Float[Array, ""] | float,
     period: Float[Array, ""],
 ) -> tuple[Float[Array, ""], Float[Array, ""], Reckoning]:
     """Advances dead reckoning by one observation.
@@ -47,7 +47,7 @@ def reckon(
     Args:
         before: Dead reckoning before it.
         speed: Speed of the command before it, m/s.
-        odometer_share: Weight of the odometer's distance, 1; the rest is the command's.
+        odometer_fraction: Weight of the odometer's distance, 1; the rest is the command's.
         period: Control period, s.
 
     Returns:
@@ -61,7 +61,7 @@ def reckon(
     waiting = jnp.where(waits, before.waiting, 0.0)
     delay = jnp.minimum(before.delay + late.astype(jnp.int32), MAX_DELAY)
     speeds = jnp.concatenate([speed[None], before.speeds[:-1]])
-    fraction = jnp.where(still, 0.0, odometer_share)
+    fraction = jnp.where(still, 0.0, odometer_fraction)
     distance = jnp.where(waiting > 0.0, 0.0, fraction * moved + (1.0 - fraction) * speeds[delay] * period)
     turn = jnp.where(waiting > 0.0, 0.0, jnp.where(still, jnp.nan, turned))
     return distance, turn, Reckoning(obs.distance, obs.heading, speeds, delay, waiting)
@@ -81,7 +81,7 @@ def seems_still(read: Float[Array, ""], commanded: Float[Array, ""]) -> Bool[Arr
 
     Its noise may go on; below 3 cm noise of 1 cm would decide.
     """
-    return (commanded > _LEAST_COMMAND) & (jnp.abs(read) < _STILL_SHARE * commanded)
+    return (commanded > _LEAST_COMMAND) & (jnp.abs(read) < _STILL_FRACTION * commanded)
 
 
 def unobserved_distance(now: Reckoning, period: Float[Array, ""]) -> Float[Array, ""]:
@@ -90,7 +90,7 @@ def unobserved_distance(now: Reckoning, period: Float[Array, ""]) -> Float[Array
     return period * jnp.sum(late)
 
 
-def odometer_share(params: EnvParams) -> float:
+def odometer_fraction(params: EnvParams) -> float:
     """Return the weight of the odometer that minimises the variance of the fused scale: inverse to the variances."""
     errors = odometer_errors(params), command_errors(params)
     odometer, plant = (lasting**2 + changing**2 for lasting, changing in errors)

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from subterra_jax.baselines.agent import Known, Observed, level_intensity, level_ranges, range_sigma
 from subterra_jax.baselines.cloud import CloudParams, cloud_params
 from subterra_jax.baselines.navigator import Navigator
-from subterra_jax.baselines.reckoning import Reckoning, begin_reckoning, odometer_share, reckon, unobserved_distance
+from subterra_jax.baselines.reckoning import Reckoning, begin_reckoning, odometer_fraction, reckon, unobserved_distance
 from subterra_jax.baselines.scanmodel import TunnelPose, move_pose
 from subterra_jax.baselines.stations import Driven, Localiser, Station, reported_start
 from subterra_jax.baselines.steering import CentreLine, find_walls, steering_of
@@ -243,12 +243,12 @@ class ScanMatcher(Localiser):
 
     motion: CloudParams  # errors of dead reckoning
     params: MatchParams  # settings of scan matching
-    odometer_share: float | Float[Array, ""]  # weight of the odometer against the command
+    odometer_fraction: float | Float[Array, ""]  # weight of the odometer against the command
     window: float = 5.0  # distance over which mismatch is summed before a correction, m
 
     @classmethod
     def of(cls, params: EnvParams) -> "ScanMatcher":
-        return cls(cloud_params(params), MatchParams(range_sigma(params)), odometer_share(params))
+        return cls(cloud_params(params), MatchParams(range_sigma(params)), odometer_fraction(params))
 
     def begin(self, obs: Observed, params: EnvParams) -> MatchMemory:
         """Begins at the believed start, on an axis that is taken to be straight."""
@@ -271,7 +271,7 @@ class ScanMatcher(Localiser):
         self, memory: MatchMemory, obs: Observed, driven: Driven, params: EnvParams, known: Known
     ) -> tuple[Station, MatchMemory]:
         period = jnp.asarray(params.vehicle.period)
-        distance, turn, reckoning = reckon(memory.reckoning, obs, driven.speed, self.odometer_share, period)
+        distance, turn, reckoning = reckon(memory.reckoning, obs, driven.speed, self.odometer_fraction, period)
         pose = move_pose(memory.pose, distance * (1.0 + memory.scale), turn, memory.pose.bend)
         covariance = _propagate(memory.covariance, distance, self.motion)
         ranges = level_ranges(obs, params)

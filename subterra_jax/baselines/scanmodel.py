@@ -26,9 +26,9 @@ class ScanModel:
     # standard deviation of the mapped walls, m, for a beam square to them; a slanting beam meets more of what the map
     # leaves out, such as the far end of a pocket instead of its back
     map_sigma: float = 0.01
-    outlier_share: float = 0.05  # fraction of the beams that meet something outside the map: dust, a box
+    outlier_fraction: float = 0.05  # fraction of the beams that meet something outside the map: dust, a box
     outlier_density: float = 0.1  # density of the residuals of such beams, 1/m
-    miss_share: float = 0.02  # fraction of the beams that get no echo from a near wall
+    miss_fraction: float = 0.02  # fraction of the beams that get no echo from a near wall
     # Longest range used, m: longer beams graze the wall. The same beams are used for every pose, or poses would be
     # compared by how many beams they leave out.
     reach: float = 9.0
@@ -149,7 +149,7 @@ def fit(
     residual = residual + shift + ends.along * turn
     each = _log_mixture(residual * residual / variance, variance, model)
     # An echo from beyond a mouth, or no echo from a wall, is unlikely.
-    missed = jnp.where(ends.missed & inside, jnp.log(model.miss_share), 0.0)
+    missed = jnp.where(ends.missed & inside, jnp.log(model.miss_fraction), 0.0)
     unlikely = jnp.where(ends.useful, jnp.log(_outlier_density(model)), missed)
     total = jnp.sum(jnp.where(useful, each, unlikely), axis=0)
     prior = (shift / model.lateral_sigma) ** 2 + (turn / model.heading_sigma) ** 2
@@ -188,12 +188,12 @@ def least_squares_step(
 
 def _outlier_density(model: ScanModel) -> float:
     """Density of an outlier's residual times its probability, 1/m."""
-    return model.outlier_share * model.outlier_density
+    return model.outlier_fraction * model.outlier_density
 
 
 def _log_mixture(
     square: Float[Array, "n_beams *n"], variance: Float[Array, "n_beams *n"], model: ScanModel
 ) -> Float[Array, "n_beams *n"]:
     """Log density of a residual, of which `square` is the square over the variance."""
-    normal = (1.0 - model.outlier_share) * jnp.exp(-0.5 * square) / jnp.sqrt(2.0 * jnp.pi * variance)
+    normal = (1.0 - model.outlier_fraction) * jnp.exp(-0.5 * square) / jnp.sqrt(2.0 * jnp.pi * variance)
     return jnp.log(normal + _outlier_density(model))

@@ -17,7 +17,7 @@ _LEAST_STEP = 1e-3  # m; a shorter step holds no information on scales
 _FLAG_SIGMA = 0.1  # m; the flag is noticed within one step of 0.2 m
 _LEAST = 0.01  # m; smallest standard deviation of an estimate
 _NO_SLIP = SlipParams(gain_sigma=0.0, yaw_sigma=0.0, wander=WanderParams(sigma=0.0))
-_NO_FAULTS = FaultParams(wet_share=0.0, wet_loss=0.0)
+_NO_FAULTS = FaultParams(wet_fraction=0.0, wet_loss=0.0)
 
 
 def slip_sizes(params: EnvParams) -> SlipParams:

@@ -133,16 +133,16 @@ def _on_wet_rail(
     drawn = lambda size: float(size) * (1.0 + spread * generator.uniform(-1.0, 1.0, _DRAWS))  # noqa: E731
     total = []
     for severity in range(int(faults.severity_low), int(faults.severity_high) + 1):
-        fraction, loss = drawn(faults.wet_share) * severity / 4.0, np.minimum(drawn(faults.wet_loss), 0.95)
+        fraction, loss = drawn(faults.wet_fraction) * severity / 4.0, np.minimum(drawn(faults.wet_loss), 0.95)
         at_end = np.where(generator.random(_DRAWS) < fraction, 1.0 - loss, 1.0)
         for goal, error in zip(distance, sigma, strict=True):
             patches = generator.binomial(max(1, round(goal / _PATCH)), np.clip(fraction, 0.0, 1.0))
             needed = goal + _PATCH * patches * loss / (1.0 - loss) + error * generator.standard_normal(_DRAWS)
-            total.append(_best_share(needed, tolerance / at_end))
+            total.append(_best_fraction(needed, tolerance / at_end))
     return float(np.mean(total))
 
 
-def _best_share(needed: Float[np.ndarray, " n"], reach: Float[np.ndarray, " n"]) -> float:
+def _best_fraction(needed: Float[np.ndarray, " n"], reach: Float[np.ndarray, " n"]) -> float:
     """Return the largest fraction of intervals `needed ± reach` that hold one and the same point."""
     ends = np.concatenate([needed - reach, needed + reach])
     change = np.concatenate([np.ones(len(needed)), -np.ones(len(needed))])

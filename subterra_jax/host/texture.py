@@ -21,7 +21,7 @@ _PATCHES = ((2.0, 2.0, 0.2), (0.5, 0.5, 0.25), (0.16, 0.16, 0.3))
 _STREAK, _STREAK_DEPTH = (0.25, 1.5), 0.5  # they only darken
 _CAST = 0.2  # spread between segments
 _JOINT_HALF, _JOINT_DEPTH = 0.03, 0.5  # m; of the logarithm
-_MARK, _MARK_SHARE, _MARK_SIZE = 0.3, 0.02, 0.6  # m of a painted mark; fraction of the wall; of the logarithm
+_MARK, _MARK_FRACTION, _MARK_SIZE = 0.3, 0.02, 0.6  # m of a painted mark; fraction of the wall; of the logarithm
 _LOWEST, _STEP = -1.3, 2.8 / 255.0  # logarithm of the table's 0, and of one of its 255 steps
 
 
@@ -103,7 +103,7 @@ def _table() -> np.ndarray:
     for along, around, spread in _PATCHES:
         log += spread * _smooth(rng.uniform(-1.0, 1.0, (round(size / along), round(size / around))))
     log += _STREAK_DEPTH * np.minimum(_smooth(rng.uniform(-1.0, 1.0, [round(size / side) for side in _STREAK])), 0.0)
-    marks = rng.random(2 * [round(size / _MARK)]) < _MARK_SHARE
+    marks = rng.random(2 * [round(size / _MARK)]) < _MARK_FRACTION
     cell = np.arange(_SIDE) * len(marks) // _SIDE
     log += _MARK_SIZE * marks[cell[:, None], cell]
     steps = np.clip(np.rint((log - _LOWEST) / _STEP), 0, 255).astype(np.uint32)

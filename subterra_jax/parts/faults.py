@@ -23,7 +23,7 @@ MAX_DELAY = 4  # steps
 PATCH = constants.WET_PATCH  # m of rail that are wet or dry as a whole
 _N_OWN = 5  # uniform numbers of a step beside those of the beams
 _WET = 17  # number of the draw that makes a patch wet
-SIZES = ("dropout_share", "dropout_steps", "dust_rate", "freeze_steps", "delay", "wet_share", "wet_loss")
+SIZES = ("dropout_fraction", "dropout_steps", "dust_rate", "freeze_steps", "delay", "wet_fraction", "wet_loss")
 
 
 @struct.dataclass
@@ -36,13 +36,13 @@ class FaultParams:
         severity_low: Least severity of an episode, 0 to 4.
         severity_high: Largest severity; the whole numbers in between are equally likely.
         dropout_rate: Probability per step that a sector of beams drops out for a while.
-        dropout_share: Largest fraction of the beams that drop out together.
+        dropout_fraction: Largest fraction of the beams that drop out together.
         dropout_steps: Longest drop-out, steps.
         dust_rate: Probability that a beam is reflected by dust before it meets the wall.
         freeze_rate: Probability per step that the odometer stops counting for a while.
         freeze_steps: Longest freeze, steps.
         delay: Age of the observation, steps; at most 4.
-        wet_share: Fraction of the 10 m patches of rail that are wet.
+        wet_fraction: Fraction of the 10 m patches of rail that are wet.
         wet_loss: Fraction of the speed lost on wet rail, while the wheels turn as before.
         spread: Each of `SIZES` is drawn evenly between 1 - spread and 1 + spread times its middle, by itself.
         origin_distance: Standard deviation of the odometer's distance at the start, m.
@@ -52,13 +52,13 @@ class FaultParams:
     severity_low: int = constants.SEVERITY_LOW
     severity_high: int = constants.SEVERITY_HIGH
     dropout_rate: float = constants.DROPOUT_RATE
-    dropout_share: float = constants.DROPOUT_SHARE
+    dropout_fraction: float = constants.DROPOUT_FRACTION
     dropout_steps: float = constants.DROPOUT_STEPS
     dust_rate: float = constants.DUST_RATE
     freeze_rate: float = constants.FREEZE_RATE
     freeze_steps: float = constants.FREEZE_STEPS
     delay: float = constants.DELAY
-    wet_share: float = constants.WET_SHARE
+    wet_fraction: float = constants.WET_FRACTION
     wet_loss: float = constants.WET_LOSS
     spread: float = constants.FAULT_SPREAD
     origin_distance: float = constants.ORIGIN_DISTANCE_SIGMA
@@ -92,7 +92,7 @@ def sensing(
 def grip(state: FaultState, station: Float[Array, ""], params: FaultParams) -> Float[Array, ""]:
     """Return true speed over wheel speed at a station: 1 on dry rail."""
     patch = jnp.floor(station / PATCH).astype(jnp.int32)
-    wet = uniform_at(state.seed, patch, _WET) < params.wet_share * _fraction(state)
+    wet = uniform_at(state.seed, patch, _WET) < params.wet_fraction * _fraction(state)
     return jnp.where(wet, 1.0 - params.wet_loss, 1.0)
 
 
@@ -111,7 +111,7 @@ def advance_faults(
             drops, jnp.ceil(params.dropout_steps * _again(draw[0], params.dropout_rate * fraction)), left
         ),
         dropout_first=jnp.where(drops, jnp.floor(draw[1] * n_beams), state.dropout_first),
-        dropout_count=jnp.where(drops, jnp.ceil(draw[2] * params.dropout_share * n_beams), state.dropout_count),
+        dropout_count=jnp.where(drops, jnp.ceil(draw[2] * params.dropout_fraction * n_beams), state.dropout_count),
         freeze_left=jnp.where(
             freezes, jnp.ceil(params.freeze_steps * draw[4]), jnp.maximum(state.freeze_left - 1.0, 0.0)
         ),

@@ -96,7 +96,7 @@ def draw_bore(kind: Kind, length: float, items: tuple[str, ...], seeds: list[np.
     extra = draw_boxes(furniture_rng, tuple(i for i in items if i in kind.fixtures), section, shift, length, own)
     pocket = np.zeros((0, 5))
     if kind.pockets is not None and rings is not None:
-        dowels = pocket_rng.random() < (kind.rings.dowel_share if kind.rings else 0.0)
+        dowels = pocket_rng.random() < (kind.rings.dowel_fraction if kind.rings else 0.0)
         pocket = _bolt_pockets(pocket_rng, kind.pockets, rings, bolts, dowels, section, length)
         pocket = _about_axis(pocket, section, shift, middle)
         pocket = _clear_pockets(pocket, grid, outline, middle, [own, extra])
@@ -157,7 +157,7 @@ def _bolt_pockets(
     station = np.broadcast_to(middle[:, None, None], turned.shape)
     within = np.stack([station, turned], axis=-1).reshape(-1, 2)
     place = np.concatenate([at_joint, within])
-    fraction = 0.95 if rng.random() < ranges.grouted_share else float(rng.uniform(*ranges.missing))
+    fraction = 0.95 if rng.random() < ranges.grouted_fraction else float(rng.uniform(*ranges.missing))
     there = rng.random(len(place)) >= fraction
     reach = 0.5 * size[0] + _END
     there &= (place[:, 0] > reach) & (place[:, 0] < length - reach)

@@ -21,7 +21,7 @@ class LineRanges:
     arc: Range  # length of constant curvature, m
     transition: Range  # length of each clothoid, over which the curvature changes evenly, m
     turn: float  # largest turn of one bend, without its clothoids, rad
-    reverse_share: float = 0.3  # fraction of bends followed by the opposite bend without a straight
+    reverse_fraction: float = 0.3  # fraction of bends followed by the opposite bend without a straight
     grid_step: float = 0.25  # step of the station grid, m
 
 
@@ -112,7 +112,7 @@ def _bends(
         knot += [knot[-1] + rng.uniform(*ranges.transition)]
         knot += [knot[-1] + arc]
         curvature += [bend, bend]
-        if rng.random() < ranges.reverse_share:
+        if rng.random() < ranges.reverse_fraction:
             side = -side
             continue
         knot += [knot[-1] + rng.uniform(*ranges.transition)]

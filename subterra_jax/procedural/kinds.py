@@ -52,7 +52,7 @@ class RingRanges:
     step_sd: Range  # standard deviation of the radial place of one segment, m; neighbours step by 1.4 times as much
     oval: Range  # excess of the horizontal over the mean radius, 1
     turned: bool  # true for universal rings: each ring is turned to the place of its key segment
-    dowel_share: float  # fraction of tunnels whose ring joints have dowels, which leave no pockets
+    dowel_fraction: float  # fraction of tunnels whose ring joints have dowels, which leave no pockets
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,7 +65,7 @@ class PocketRanges:
     depth: Range  # depth, m
     offset: Range  # distance of the middle from its joint, m
     missing: Range  # fraction of pockets that are missing or grouted flush
-    grouted_share: float  # fraction of tunnels in which nearly all (95 %) are grouted
+    grouted_fraction: float  # fraction of tunnels in which nearly all (95 %) are grouted
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,7 +117,7 @@ _BOLTS = PocketRanges(
     depth=(0.08, 0.15),  # C, M
     offset=(0.21, 0.28),  # C
     missing=(0.0, 0.3),  # M
-    grouted_share=0.15,  # B says that it happens; the fraction is ours
+    grouted_fraction=0.15,  # B says that it happens; the fraction is ours
 )
 _STRAIGHT = RingRanges(
     nominal=(1.0, 2.0),  # A, B
@@ -127,7 +127,7 @@ _STRAIGHT = RingRanges(
     step_sd=(0.0015, 0.005),  # M: steps of 2 to 10 mm between neighbours
     oval=(0.0, 0.004),  # M
     turned=False,
-    dowel_share=0.0,
+    dowel_fraction=0.0,
 )
 _LINESIDE = ("cabinet", "signal", "bracket", "walkway", "trough")
 _METRO_FIXTURES = ("cross-passage", *_LINESIDE)
@@ -152,7 +152,7 @@ KINDS: dict[str, Kind] = {
             _CONCRETE,
             0.125,
             # Dowels instead of bolts in ring joints are common with universal rings (M); the fraction is ours.
-            rings=dataclasses.replace(_STRAIGHT, turned=True, dowel_share=0.5),
+            rings=dataclasses.replace(_STRAIGHT, turned=True, dowel_fraction=0.5),
             pockets=_BOLTS,
             fixtures=_METRO_FIXTURES,
         ),

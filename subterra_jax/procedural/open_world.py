@@ -74,7 +74,7 @@ def figures() -> dict[str, Any]:
         "held_out": HELD_OUT,
         "line": dataclasses.asdict(LINE),
         "grade": (GRADE_SD, GRADE_MOST, GRADE_WAVE),
-        "share": _HALF,
+        "fraction": _HALF,
     }
 
 

@@ -74,7 +74,7 @@ def test_a_few_bad_times_are_left_out_and_counted(tmp_path, kind, unit):
 
 
 @pytest.mark.parametrize("how", [{}, {"point_type": "u4", "point_unit": "ns"}])
-def test_many_bad_times_are_refused_with_their_share(tmp_path, how):
+def test_many_bad_times_are_refused_with_their_fraction(tmp_path, how):
     bag = write_convention(tmp_path / "a.bag", bad_times=0.07, count=40, **how)
     with pytest.raises(RecordingError, match=r"a\.bag: [678]% of the points of /points"):
         read(bag)

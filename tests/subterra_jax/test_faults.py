@@ -17,7 +17,7 @@ from subterra_jax.tunnel import Tunnel
 
 N, BEAMS = 4000, 16
 ZERO = faults.FaultParams(
-    dropout_rate=0.0, dust_rate=0.0, freeze_rate=0.0, delay=0.0, wet_share=0.0, severity_low=4, severity_high=4
+    dropout_rate=0.0, dust_rate=0.0, freeze_rate=0.0, delay=0.0, wet_fraction=0.0, severity_low=4, severity_high=4
 )
 
 
@@ -82,7 +82,7 @@ def test_dust_reflects_the_stated_share_of_beams_somewhere_before_the_wall():
 
 
 def test_dropped_beams_are_one_sector_that_reports_the_largest_range():
-    params = dataclasses.replace(ZERO, dropout_rate=0.5, dropout_share=0.75)
+    params = dataclasses.replace(ZERO, dropout_rate=0.5, dropout_fraction=0.75)
     state = run(params, 5)[-1]
     draw = jnp.zeros(5 + BEAMS)
     corrupted = np.asarray(
@@ -122,7 +122,7 @@ def test_observations_are_as_late_as_the_severity_says():
 
 
 def test_wet_rail_takes_the_stated_share_of_the_speed_in_whole_patches():
-    params = dataclasses.replace(ZERO, wet_share=0.3)
+    params = dataclasses.replace(ZERO, wet_fraction=0.3)
     state = jax.tree.map(lambda leaf: leaf[0], fresh(params, 1))
     places = np.arange(0.0, 20_000.0, 2.5, np.float32)
     grip = np.asarray(each(faults.grip, (None, 0, None))(state, places, params))

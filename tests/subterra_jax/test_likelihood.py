@@ -150,7 +150,7 @@ def reference_fit(walls, ends, i: int, model: ScanModel) -> tuple[float, float, 
     shift, turn = np.linalg.solve((rows * weight) @ rows.T + prior, -(rows * weight) @ residual)
     residual = residual + shift + along * turn
     normal = np.exp(-0.5 * residual**2 / variance) / np.sqrt(2.0 * np.pi * variance)
-    each = np.log((1.0 - model.outlier_share) * normal + model.outlier_share * model.outlier_density)
+    each = np.log((1.0 - model.outlier_fraction) * normal + model.outlier_fraction * model.outlier_density)
     drawn = (shift / model.lateral_sigma) ** 2 + (turn / model.heading_sigma) ** 2
     return model.power * (each[useful].sum() - 0.5 * drawn), shift, turn
 

@@ -27,7 +27,7 @@ from tests.subterra_jax.patches import HALF, N_METRES, drive_past, map_of_walls,
 
 def _random_blocks(n, key=1):
     rng = np.random.default_rng(key)
-    evidence = 2.0 * rng.standard_normal((n, len(matching.SHARES)))
+    evidence = 2.0 * rng.standard_normal((n, len(matching.FRACTIONS)))
     evidence[:DELAY] = 0.0
     return Block(
         jnp.asarray(evidence, jnp.float32), jnp.asarray(0.03 * rng.standard_normal(n), jnp.float32), jnp.full(n, 5.0)

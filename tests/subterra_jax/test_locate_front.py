@@ -23,7 +23,7 @@ def test_the_untrained_front_end_finds_the_error_of_the_command(fraction):
     record = jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype != bool else x, drive_past(fraction))
     blocks = _metres(record, N_METRES)
     total = np.asarray(blocks.evidence)[DELAY + 10 :].sum(axis=0)
-    assert matching.SHARES[total.argmax()] == pytest.approx(fraction, abs=0.0045)
+    assert matching.FRACTIONS[total.argmax()] == pytest.approx(fraction, abs=0.0045)
     assert total.max() - total.mean() > 3.0
 
 
@@ -104,7 +104,7 @@ def test_strips_above_the_level_ring_tell_the_error_of_the_command(fraction):
     record = streams.Record(jnp.asarray(driven), jnp.asarray((1.0 + fraction) * driven), points)
     blocks = _metres(record, 30)
     total = np.asarray(blocks.evidence)[DELAY + 8 :].sum(axis=0)
-    assert matching.SHARES[total.argmax()] == pytest.approx(fraction, abs=0.0045)
+    assert matching.FRACTIONS[total.argmax()] == pytest.approx(fraction, abs=0.0045)
     level = record.replace(points=jax.tree.map(lambda leaf: leaf[:, : 4 * strips.RAYS], points))
     blind = _metres(level, 30)
     assert np.ptp(np.asarray(blind.evidence), axis=1).max() < 0.2, "at the level of the sensor the wall is smooth"

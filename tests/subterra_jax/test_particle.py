@@ -82,7 +82,7 @@ def test_the_age_of_what_is_observed_shows_when_the_robot_sets_off():
 def test_the_odometer_weighs_as_much_as_its_nominal_errors_allow():
     _, params = st.make("Subterra/StopAtShort-v1", tunnel="subterra-351")
     # Variances: odometer 0.02² + 0.01², plant 0.02² + 0.02².
-    assert reckoning.odometer_share(params) == pytest.approx(8.0 / 13.0, rel=1e-5)
+    assert reckoning.odometer_fraction(params) == pytest.approx(8.0 / 13.0, rel=1e-5)
 
 
 def test_a_cloud_that_faces_back_drives_to_smaller_stations(plan_of):
@@ -185,7 +185,7 @@ def test_the_ceiling_takes_likelihoods_whole_about_a_start_and_drives_as_far_as_
     _, params = st.make("Subterra/StopAtShort-v1", tunnel="control")
     motion = ceiling(params).localiser.motion
     assert motion.odometer is not None
-    assert motion.least_share < 0.1
+    assert motion.least_fraction < 0.1
     _, params = st.make("Subterra/Relocalise-v1", tunnel="control")
     made = ceiling(params)
     assert made.localiser.n_cells * made.localiser.cell >= float(params.tunnel.length)
@@ -198,6 +198,6 @@ def test_the_ceiling_spares_its_particles_where_the_start_is_hidden():
         ceiling(st.make(f"Subterra/{name}-v1", "control", hidden_start=hidden)[1]).localiser for name, hidden in cases
     ]
     assert [one.n_particles for one in made] == [512, 1024, 512, 1024, 2048]
-    least = [one.motion.least_share for one in made]
+    least = [one.motion.least_fraction for one in made]
     assert max(least[i] for i in (0, 1, 2, 4)) < 0.1
     assert least[3] > 0.3

@@ -13,7 +13,7 @@ class Block:
     """One metre of commanded distance."""
 
     # log likelihood of each error compared, by the block `DELAY` metres ago; 0 where there is none
-    evidence: Float[Array, "n_shares"]
+    evidence: Float[Array, "n_fractions"]
     read: Float[Array, ""]  # distance that the odometer counted in this metre, less 1, m
     steps: Float[Array, ""]  # steps taken in this metre
 
@@ -27,7 +27,7 @@ class Estimate:
     log_scale: Float[Array, ""]  # log of the mean absolute error of `correction` that is expected, m
 
 
-def matched_inputs(block: Block, fractions: Float[Array, "n_shares"]) -> Float[Array, "n"]:
+def matched_inputs(block: Block, fractions: Float[Array, "n_fractions"]) -> Float[Array, "n"]:
     """Returns evidence over the errors `shares`, and odometry, as inputs of a network."""
     centred = block.evidence - jnp.mean(block.evidence, axis=-1, keepdims=True)
     belief = jnp.exp(block.evidence - jnp.max(block.evidence, axis=-1, keepdims=True))

@@ -16,8 +16,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from subterra_jax.policies.locate.profiles import BIN, BLOCK, N_BEARINGS, Grid, Profiles, mean_along
 
 # Errors of the command that are compared: those of slip; and of wet rail, which takes a tenth to half of the speed.
-SHARES = np.linspace(-0.08, 0.08, 41).astype(np.float32)
-WIDE_SHARES = np.concatenate([np.linspace(-0.53, -0.11, 22), SHARES]).astype(np.float32)
+FRACTIONS = np.linspace(-0.08, 0.08, 41).astype(np.float32)
+WIDE_FRACTIONS = np.concatenate([np.linspace(-0.53, -0.11, 22), FRACTIONS]).astype(np.float32)
 LAGS = 13  # bins by which a profile is shifted to either side
 _MEAN, _TAPS = 8, 9  # bins to either side of a running mean; bins of the filter
 MARGIN = _MEAN + _TAPS // 2  # bins about a block that its evidence depends on, beside the shifts
@@ -32,7 +32,7 @@ Weights = dict[str, Any]
 _einsum = partial(jnp.einsum, precision="highest")  # differences of squares: no TF32
 
 
-def init(key: PRNGKeyArray, compared: Any = SHARES) -> Weights:
+def init(key: PRNGKeyArray, compared: Any = FRACTIONS) -> Weights:
     """Returns weights from which learning goes on: edges that beams ahead or behind see sharply, and smoothed relief.
 
     Among them are the errors that are compared, which are not learnt.
@@ -66,7 +66,7 @@ def _in_middle(taps: list[float]) -> Float[Array, "tap"]:
     return jnp.pad(jnp.array(taps), (_TAPS - len(taps)) // 2)
 
 
-def fractions(weights: Weights) -> Float[Array, "n_shares"]:
+def fractions(weights: Weights) -> Float[Array, "n_fractions"]:
     """Returns the errors of the command that are compared."""
     return jax.lax.stop_gradient(weights["shares"])
 
@@ -99,7 +99,7 @@ def _running(values: Grid, n: int) -> Grid:
     return total[..., 2 * _MEAN + 1 : 2 * _MEAN + 1 + n] - total[..., :n]
 
 
-def evidence(weights: Weights, profiles: Profiles) -> Float[Array, "n_shares"]:
+def evidence(weights: Weights, profiles: Profiles) -> Float[Array, "n_fractions"]:
     """Returns the log likelihood, up to a constant, of each of `shares` by one block.
 
     Args:
@@ -117,7 +117,7 @@ def compare(
     features: Float[Array, "side 7 bins c"],
     there: Float[Array, "side 7 bins c"],
     along: Float[Array, "side 7"],
-) -> Float[Array, "n_shares"]:
+) -> Float[Array, "n_fractions"]:
     """Compares the pairs of beams on either side.
 
     Args:

@@ -13,7 +13,7 @@ from subterra_jax.policies.locate.blocks import DELAY, Block, Estimate, matched_
 
 Weights = dict[str, Any]
 MAP = "map"  # the weights that take a map
-_COMPARED = {"match": matching.SHARES, "wide": matching.WIDE_SHARES}
+_COMPARED = {"match": matching.FRACTIONS, "wide": matching.WIDE_FRACTIONS}
 _UNIT = 0.02  # of the speed: answers of order 1
 
 
@@ -47,7 +47,7 @@ def init(front: str, key: PRNGKeyArray, with_map: bool = False) -> Weights:
 
 def front_of(tensors: Any) -> str:
     """Returns the front end of weights by name."""
-    return "wide" if tensors["match.shares"].shape == matching.WIDE_SHARES.shape else "match"
+    return "wide" if tensors["match.shares"].shape == matching.WIDE_FRACTIONS.shape else "match"
 
 
 def passed(estimate: Estimate, age: Array) -> Array:

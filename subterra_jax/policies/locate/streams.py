@@ -47,13 +47,13 @@ def profiles_of(record: Record, n: int) -> Profiles:
     return profiles.add_points(profiles.blank(BLOCK * n + BEFORE + _AFTER, record.points.n_sides), record.points, where)
 
 
-def _evidence(record: Record, weights: matching.Weights, n: int) -> Float[Array, "n n_shares"]:
+def _evidence(record: Record, weights: matching.Weights, n: int) -> Float[Array, "n n_fractions"]:
     """Returns the evidence of the block `DELAY` metres before each metre."""
     whole = profiles_of(record, n)
     features, there = matching.encode(weights, whole)
     first = BEFORE - matching.MARGIN - matching.LAGS  # of the first block's cut, in features
 
-    def one(block: Array) -> Float[Array, "n_shares"]:
+    def one(block: Array) -> Float[Array, "n_fractions"]:
         begin, width = first + BLOCK * block, BLOCK + 2 * matching.LAGS
         some = jax.lax.dynamic_slice_in_dim(features, begin, width, axis=2)
         weight = jax.lax.dynamic_slice_in_dim(there, begin, width, axis=2)
