@@ -139,14 +139,10 @@ def _drive_all(arguments: Command) -> tuple[transfer.Walk, transfer.Row, Any]:
     with ProcessPoolExecutor(arguments.jobs, get_context("spawn")) as pool:
         done = list(pool.map(_drive, [arguments] * arguments.jobs, range(arguments.jobs)))
     steps = max(rows.lateral.shape[0] for _, rows, _ in done)
-    longer = [jax.tree.map(lambda leaf: _lengthen(leaf, steps), rows) for _, rows, _ in done]
+    over = lambda leaf: np.full((steps - len(leaf), *leaf.shape[1:]), np.nan, leaf.dtype)  # noqa: E731
+    longer = [jax.tree.map(lambda leaf: np.concatenate([leaf, over(leaf)]), rows) for _, rows, _ in done]
     rows = jax.tree.map(lambda *parts: np.concatenate(parts, axis=1), *longer)
     return jax.tree.map(lambda *parts: np.concatenate(parts), *(walk for walk, _, _ in done)), rows, done[0][2]
-
-
-def _lengthen(leaf: np.ndarray, steps: int) -> np.ndarray:
-    """Fills up with NaN, as for robots that are over."""
-    return np.concatenate([leaf, np.full((steps - len(leaf), *leaf.shape[1:]), np.nan, leaf.dtype)])
 
 
 def command(arguments: Command) -> None:

@@ -115,14 +115,10 @@ def test_no_name_is_used_that_nobody_made() -> None:
     assert unknown("def f(x):\n    return x + Y") == {"Y"}
 
 
-def arrows(sources: dict[str, str]) -> dict[str, set[str]]:
-    """Which files each file imports; `from package import module` is an arrow to the module."""
-    return {module: (read(one).modules | read(one).members) & set(sources) for module, one in sources.items()}
-
-
 def circles(sources: dict[str, str]) -> list[set[str]]:
     """Groups of files of which each leads to all others."""
-    leads_to = arrows(sources)
+    # Which files each file imports; `from package import module` is an arrow to the module.
+    leads_to = {module: (read(one).modules | read(one).members) & set(sources) for module, one in sources.items()}
     reached = {}
     for module in leads_to:
         seen, waiting = set(), [module]

@@ -68,11 +68,6 @@ def corridor(things: list[Thing], recesses: tuple[Thing, ...] = ()) -> np.ndarra
     return points @ _TURN + PLACE
 
 
-def in_corridor(points: np.ndarray) -> np.ndarray:
-    """Return points of the cloud's frame by station, to the left of the middle and above the floor, m."""
-    return (points - PLACE) @ _TURN.T
-
-
 def _faces(box: Thing, rng: np.random.Generator, ends: bool = True) -> np.ndarray:
     low, high = np.array(box).T
     parts = []
@@ -113,7 +108,7 @@ def built(things: list[Thing], recesses: tuple[Thing, ...] = ()) -> tuple[Bore, 
     cleaned = clean_cloud(cloud, CentrelineConfig())
     _, bore = fit_unfolded(cleaned.cloud, cleaned.axis, 12.0, cleaned.behind)
     judgement = judge_bore(bore, cloud, JudgingConfig(), cause=cleaned.cause)
-    surface = in_corridor(bore.surface() + cloud.origin)
+    surface = (bore.surface() + cloud.origin - PLACE) @ _TURN.T  # station, left of the middle, above the floor, m
     return bore, cleaned, surface, any(warning.refuses for warning in judgement.warnings)
 
 
