@@ -61,7 +61,7 @@ def write_curve(runs: list[Path], png: Path, lines: Mapping[str, float] = Mappin
     Args:
         runs: Run folders; each gets a `curve.csv` of its own.
         png: File of the figure.
-        lines: Shares to draw as lines through it, by what they are called.
+        lines: Fractions to draw as lines through it, by what they are called.
 
     Raises:
         RunFolderError: One of them cannot be read; nothing is drawn then.
@@ -147,7 +147,7 @@ class Command:
 
     runs: tyro.conf.Positional[tuple[Path, ...]]  # run folders
     out: Path = Path("curve.png")  # the figure
-    # shares to draw as lines, by name: `--lines floor 0.32 ceiling 0.997`
+    # fractions to draw as lines, by name: `--lines floor 0.32 ceiling 0.997`
     lines: dict[str, float] = dataclasses.field(default_factory=dict)
 
 

@@ -161,7 +161,7 @@ def mix_pixels(
     """Return distances in which some beams across a depth edge fall between its two surfaces, m.
 
     A beam straddles an edge if a ray from its rim, to a drawn side, meets a surface more than `EDGE_STEP` off the
-    plane that its middle meets, and less than `PULSE` further or nearer. Of those, `share` report a distance drawn
+    plane that its middle meets, and less than `PULSE` further or nearer. Of those, `fraction` report a distance drawn
     evenly between the two. Rays are in the survey frame, m; `hits` is the first surface on the middle of each.
     """
     chosen = np.flatnonzero((rng.random(len(heading), np.float32) < fraction) & np.isfinite(hits.distance))

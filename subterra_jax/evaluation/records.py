@@ -228,7 +228,7 @@ class Tally:
     # where it stood less where it should have (of what it reported less where it stood), m
     goal_error: Float[Array, ""]
     coverage: Float[Array, ""]  # fraction of the tunnel covered when the episode was over
-    progress: Float[Array, ""]  # share covered had the robot gone on to the far mouth
+    progress: Float[Array, ""]  # fraction covered had the robot gone on to the far mouth
     over: Bool[Array, ""]  # the episode is over as published; what comes after only counts as progress
     estimates: EstimateTally  # scores of its estimate
 

@@ -17,7 +17,7 @@ def patches(station, seed=3):
 
 
 def drive_past(fraction, sigma=0.02, seed=0):
-    """A robot in the middle of a straight tunnel that drives (1 + share) times what is commanded."""
+    """A robot in the middle of a straight tunnel that drives (1 + fraction) times what is commanded."""
     driven = 0.2 * np.arange(5 * N_METRES + 2)
     angle = np.deg2rad(22.5) * np.arange(1, 8)
     along = np.broadcast_to(HALF / np.tan(angle), (len(driven), 2, 7))

@@ -228,7 +228,7 @@ def test_every_named_sensor_has_unit_beams_in_order_of_its_image(name):
         assert (np.diff(times, axis=1) > 0.0).all()
 
 
-# Written down a second time. Noise, height and shares of lost and mixed returns are those of every sensor.
+# Written down a second time. Noise, height and fractions of lost and mixed returns are those of every sensor.
 ECHO = {"sigma": 0.019, "sigma_per_metre": 1e-4, "sigma_slant": 0.002, "lost": 0.004, "mixed": 0.1,
         "losing": True, "mixing": False}  # fmt: skip
 RINGS = list(range(-15, 16, 2))  # degrees

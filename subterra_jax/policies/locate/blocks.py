@@ -28,7 +28,7 @@ class Estimate:
 
 
 def matched_inputs(block: Block, fractions: Float[Array, "n_fractions"]) -> Float[Array, "n"]:
-    """Returns evidence over the errors `shares`, and odometry, as inputs of a network."""
+    """Returns evidence over the errors `fractions`, and odometry, as inputs of a network."""
     centred = block.evidence - jnp.mean(block.evidence, axis=-1, keepdims=True)
     belief = jnp.exp(block.evidence - jnp.max(block.evidence, axis=-1, keepdims=True))
     belief = belief / jnp.sum(belief, axis=-1, keepdims=True)

@@ -100,7 +100,7 @@ def _running(values: Grid, n: int) -> Grid:
 
 
 def evidence(weights: Weights, profiles: Profiles) -> Float[Array, "n_fractions"]:
-    """Returns the log likelihood, up to a constant, of each of `shares` by one block.
+    """Returns the log likelihood, up to a constant, of each of `fractions` by one block.
 
     Args:
         weights: Trained weights, as `init` makes them.

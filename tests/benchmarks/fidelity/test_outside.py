@@ -99,7 +99,7 @@ def test_metrics_are_scored_beside_the_suite_and_leave_it_alone(tmp_path: Path) 
 DENT = """
 @fault_kind("dent", "lining 1 cm smaller", "m", doses=(0.01, 0.1), falls={"C2M": 10.0})
 def dent(site, fault):
-    return site.moved(lambda local: -fault.size * fault.share(local[:, 0])[:, None] * [0.0, 0.3, 0.3], ("lining",))
+    return site.moved(lambda local: -fault.size * fault.weight(local[:, 0])[:, None] * [0.0, 0.3, 0.3], ("lining",))
 """
 
 
