@@ -184,7 +184,7 @@ class SplitConfig:
 def deal_blocks(duration: float, config: SplitConfig) -> Int[np.ndarray, " b"]:
     """Return the part of each block of a recording of some seconds.
 
-    Blocks are dealt in hands of five, each of which holds the parts in their fractions, so that every part sees the whole
+    Blocks are dealt in hands of five, each with the parts in their fractions, so that every part sees the whole
     tunnel; the order within a hand is drawn.
     """
     hand = np.repeat(np.arange(3), np.round(5 * np.asarray(config.fractions)).astype(int))

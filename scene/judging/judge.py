@@ -39,9 +39,7 @@ class JudgingConfig:
 
     tolerance: float = 0.10  # A return this near to the model is explained by it, m.
     warn_above: float = 0.05  # Fraction of unexplained returns between the ends above which the build warns.
-    refuse_above: float = (
-        0.35  # Fraction above which it fails; what was cut away as another bore or terrain is left out.
-    )
+    refuse_above: float = 0.35  # Fraction above which it fails; what was cut away as another bore or terrain is out.
     force: Annotated[bool, _FLAG] = False  # Build all the same where the judgement would refuse.
 
 

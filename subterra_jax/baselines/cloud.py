@@ -50,8 +50,8 @@ class CloudParams:
     slip_rate: float | Float[Array, ""] = 0.0
     slip_loss: float | Float[Array, ""] = 0.3  # fraction of the speed lost on wet rail, 1
     ess_fraction: float = 0.5  # the cloud is resampled when its effective size falls below this fraction
-    # Fraction to which one scan may reduce the effective size. A likelihood that would reduce it further is flattened, so
-    # that chance does not select a few particles of a sparse cloud.
+    # Fraction to which one scan may reduce the effective size. A likelihood that would reduce it further is flattened,
+    # so that chance does not select a few particles of a sparse cloud.
     least_fraction: float = 0.5
     roughening: float = 0.0005  # standard deviation of the noise on the lasting scale error of a resampled particle, 1
     jitter: float = 0.2  # standard deviation of the noise on its station, in lengths of the cloud over its particles
