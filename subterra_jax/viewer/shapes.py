@@ -12,6 +12,7 @@ from subterra_jax.tunnel.plan import TunnelPlan, Wall
 Colour = tuple[int, int, int]  # red, green, blue, 0 to 255
 WALL_HEIGHT = 2.6  # m, for looks: a plan holds the walls at one height
 _UNDER_RECESSES = 0.5  # m of floor beyond the walls
+_BALLAST = 0.12  # m that floor and walls are drawn lower where a track lies, or they hide its sleepers in canted bends
 _WALL, _FLOOR, _FURNITURE = (176, 172, 164), (112, 108, 102), (96, 120, 134)
 
 
@@ -59,7 +60,9 @@ def planar_shapes(plan: TunnelPlan, lining: str) -> list[Shape]:
         _ribbon("right", centreline, walls.right, inward=True),
         _floor(centreline),
     ]
-    if plan.shell is not None:
+    if plan.shell is not None and len(plan.shell.track):
+        for shape in shapes:
+            shape.vertices[:, 2] -= _BALLAST
         shapes += [_track(surface) for surface in track_surfaces(plan.shell)]
     return [*shapes, _furniture(centreline, walls.furniture)] if len(walls.furniture) else shapes
 
