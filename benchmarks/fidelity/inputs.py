@@ -211,9 +211,9 @@ def split_recording(recording: Path, out: Path, config: SplitConfig) -> dict[str
     """
     require_input(recording)
     check_settings(config)
-    fifths = np.round(5 * np.asarray(config.shares))
+    fifths = np.round(5 * np.asarray(config.fractions))
     if fifths.sum() != 5 or (fifths < 1).any():
-        raise FidelityError(f"shares must be fifths, each at least one, that sum to 1, got {config.shares}")
+        raise FidelityError(f"fractions must be fifths, each at least one, that sum to 1, got {config.fractions}")
     if config.guard >= config.block:
         raise FidelityError(f"guard must be shorter than a block of {config.block:g} s, got {config.guard:g}")
     with _open_bag(recording) as reader, replace_folder(out, "split.json") as folder:

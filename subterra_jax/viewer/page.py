@@ -55,8 +55,8 @@ def write_page(path: Path, drawn: Drawn, shapes: list[Shape], radius: float, fac
         serializer = server.get_scene_serializer()
         for row in range(len(drawn)):
             player.show(row)
-            for part in range(_FRAMES if row + 1 < len(drawn) else 1):
-                player.move(row, part / _FRAMES)
+            for step in range(_FRAMES if row + 1 < len(drawn) else 1):
+                player.move(row, step / _FRAMES)
                 serializer.insert_sleep(drawn.trace.period / _FRAMES)
         page = serializer.as_html(dark_mode=True)
     with replace_file(path) as part:

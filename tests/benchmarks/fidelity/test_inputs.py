@@ -132,7 +132,7 @@ def test_a_recording_shorter_than_five_blocks_is_refused(tmp_path: Path) -> None
     short = write_bag(tmp_path / "short.bag", [(100.0 + k, np.ones((2, 3))) for k in range(5)])
     with pytest.raises(FidelityError, match="shorter than five blocks"):
         split_recording(short, tmp_path / "parts", CONFIG)
-    for wrong in (SplitConfig(block=0.0), SplitConfig(guard=2.0), SplitConfig(shares=(0.5, 0.5, 0.5))):
-        with pytest.raises(SubterraError, match=r"block|shares"):
+    for wrong in (SplitConfig(block=0.0), SplitConfig(guard=2.0), SplitConfig(fractions=(0.5, 0.5, 0.5))):
+        with pytest.raises(SubterraError, match=r"block|fractions"):
             split_recording(short, tmp_path / "parts", wrong)
     assert not (tmp_path / "parts").exists()
