@@ -1,5 +1,6 @@
 """The unrolled lining: depth maps, the grid of the rings, pockets."""
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -197,10 +198,17 @@ def ring_pitch(unrolled: Unrolled, near: float, band: float) -> float | None:
         return None
     tried = near * np.linspace(1 - band, 1 + band, _PITCH_STEPS)
     centred = (signal - signal.mean()) * np.hanning(len(signal))
-    power = sum(
-        np.abs(_fourier(centred, unrolled.station, order / tried)) ** 2 for order in range(1, PITCH_HARMONICS + 1)
-    )
-    return float(tried[np.argmax(power)])
+    return float(tried[np.argmax(_comb_power(centred, unrolled.station, 1.0 / tried))])
+
+
+def _comb_power(signal: np.ndarray, station: np.ndarray, frequency: np.ndarray) -> np.ndarray:
+    """Return the power of a signal at some frequencies and their harmonics together."""
+    power = []
+    for part in np.array_split(frequency, max(len(frequency) // 100, 1)):
+        wave = np.exp(-2j * np.pi * part[:, None] * station)
+        harmonics = itertools.accumulate([wave] * PITCH_HARMONICS, np.multiply)
+        power.append(sum(np.abs(one @ signal) ** 2 for one in harmonics))
+    return np.concatenate(power)
 
 
 @per_reference
@@ -218,7 +226,7 @@ def ring_phases(unrolled: Unrolled, length: float) -> Float[np.ndarray, " w"]:
     result = []
     for start in range(0, max(len(signal) - size, 0) + 1, max(size // 2, 1)):
         part, station = signal[start : start + size], unrolled.station[start : start + size]
-        value = _fourier(part - part.mean(), station, np.array([1.0 / length]))[0]
+        value = (np.exp(-2j * np.pi * np.array([[1.0 / length]]) * station) @ (part - part.mean()))[0]
         result.append(np.angle(value) if part.mean() > _FAINT else np.nan)
     return np.array(result)
 
@@ -231,11 +239,6 @@ def pocket_rows(unrolled: Unrolled, arc: Float[np.ndarray, " m"]) -> Float[np.nd
         return np.zeros(0)
     peaks, _ = find_peaks(smooth, height=_ROW_HEIGHT * smooth.max(), distance=4)
     return arc[peaks]
-
-
-def _fourier(signal: np.ndarray, station: np.ndarray, frequency: np.ndarray) -> np.ndarray:
-    parts = np.array_split(frequency, max(len(frequency) // 100, 1))
-    return np.concatenate([np.exp(-2j * np.pi * part[:, None] * station) @ signal for part in parts])
 
 
 # Pockets: those that a map shows, those of the truth, and the pairs of both.
