@@ -38,6 +38,11 @@ class Trajectory:
     def _slerp(self) -> Slerp:
         return Slerp(self.times, self.rotations)
 
+    @cached_property
+    def _columns(self) -> Float[np.ndarray, "4 n"]:
+        """Times and positions axis by axis: `np.interp` would copy columns of rows whole at every call."""
+        return np.stack([self.times, *self.positions.T])
+
     def covers(self, start: float, end: float) -> bool:
         """Return whether poses exist over the whole interval, s."""
         return bool(self.times[0] <= start and end <= self.times[-1])
@@ -45,7 +50,8 @@ class Trajectory:
     def at(self, times: Float[np.ndarray, " k"]) -> tuple[Float[np.ndarray, "k 3"], Rotation]:
         """Return positions (linear) and rotations (slerp) at times, s; beyond the ends the nearest pose holds."""
         clipped = np.clip(times, self.times[0], self.times[-1])
-        positions = np.stack([np.interp(clipped, self.times, column) for column in self.positions.T], axis=1)
+        known, *columns = self._columns
+        positions = np.stack([np.interp(clipped, known, column) for column in columns], axis=1)
         return positions, self._slerp(clipped)
 
 
