@@ -99,19 +99,14 @@ IMUS: dict[LidarName, tuple[Imu, ...]] = {
 }
 
 
-def prism_from(name: LidarName) -> Float[np.ndarray, "3"]:
-    """Return the prism in the coordinates of a LiDAR, m."""
-    mount = LIDARS[name]
-    return mount.rotation @ PRISM.origin + mount.shift
-
-
 def calibration(name: LidarName) -> dict[str, Any]:
     """Return the content of a calibration file of one device, per docs/formats.md."""
     imus = {
         imu.topic: {key: np.round(getattr(imu.mount, key), 9).tolist() for key in ("rotation", "shift")}
         for imu in IMUS[name]
     }
-    return {"prism": np.round(prism_from(name), 9).tolist(), "imu": imus}
+    prism = LIDARS[name].rotation @ PRISM.origin + LIDARS[name].shift  # in the coordinates of the LiDAR, m
+    return {"prism": np.round(prism, 9).tolist(), "imu": imus}
 
 
 START, STOP = -10.0, -2.0  # m: from the first mouth; from the second

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, TypeVar
 
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
@@ -202,22 +202,11 @@ def n_sweeps(carried: Carried, every: int) -> int:
 
 # What floats between the LiDAR and the walls: from rays in the LiDAR's frame and what they hit to what they then hit.
 Veil = Callable[[np.random.Generator, Float[np.ndarray, "n 3"], Hits], Hits]
+Look = TypeVar("Look")
 
 
-class _Look(NamedTuple):
-    """What the beams of some sweeps meet, before anything is drawn."""
-
-    numbers: np.ndarray
-    ray: Float[np.ndarray, "n 3"]  # Unit vectors in the LiDAR's frame
-    heading: Float[np.ndarray, "n 3"]  # The same in the survey frame
-    poses: Poses
-    station: float  # m
-    loaded: Loaded
-    hits: Hits
-
-
-def _look_ahead(look: Callable[[np.ndarray], _Look], batches: list[np.ndarray]) -> Iterator[_Look]:
-    """Yields the look of each batch; a second thread is one batch ahead, since numpy and embree leave it the time."""
+def _look_ahead(look: Callable[[np.ndarray], Look], batches: list[np.ndarray]) -> Iterator[Look]:
+    """Yields what `look` returns for each batch; a second thread is one batch ahead: numpy and embree let it run."""
     with ThreadPoolExecutor(1) as second:
         coming = [second.submit(look, batch) for batch in batches[:1]]
         for following in [*batches[1:], None]:
@@ -250,14 +239,14 @@ def sweeps(
     at_once = max(1, _RAYS_AT_ONCE // len(offset)) if every == 1 else 1
     n = len(offset)
 
-    def look(batch: np.ndarray) -> _Look:
+    def look(batch: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, Poses, float, Loaded, Hits]:
         begin = SCAN_PERIOD * batch
         ray = lidar.directions((begin[:, None] + 1e-9 * lidar.offset).ravel(), phase)
         poses = carried.poses_between(begin[0], (begin[:, None] + 1e-9 * offset).ravel())
         heading = rotate(poses.quaternion, ray)
         station = float(carried.walk.station(begin[:1])[0])
         loaded = caster.load(station, poses.position[0])
-        return _Look(batch, ray, heading, poses, station, loaded, loaded.cast(poses.position, heading))
+        return batch, ray, heading, poses, station, loaded, loaded.cast(poses.position, heading)
 
     batches = [numbers[first : first + at_once] for first in range(0, len(numbers), at_once)]
     for batch, ray, heading, poses, station, loaded, hits in _look_ahead(look, batches):
