@@ -11,7 +11,7 @@ from subterra_jax.b2.model import robot_spec
 from subterra_jax.host.rover import rover_mjcf
 from subterra_jax.physics.ground import read_track
 from subterra_jax.physics.stage import tunnel_world
-from subterra_jax.pictures.stage import Piece, stage_spec
+from subterra_jax.pictures.stage import Stretch, stage_spec
 from subterra_jax.procedural import open_world
 from subterra_jax.procedural.kinds import KINDS
 from tests.recorded import arrays_of, check
@@ -38,7 +38,7 @@ def whole_world() -> mujoco.MjSpec:
 
 
 MODELS = {
-    "picture": lambda: stage_spec(Piece(st.load_tunnel("metro", solid=True), "pockets", 100.0, 110.0)),
+    "picture": lambda: stage_spec(Stretch(st.load_tunnel("metro", solid=True), "pockets", 100.0, 110.0)),
     "b2": robot_spec,
     "rover": lambda: mujoco.MjSpec.from_string(ElementTree.tostring(rover_mjcf(), "unicode")),
     "world": whole_world,
