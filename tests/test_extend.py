@@ -19,6 +19,9 @@ from subterra_jax.host.loading import load_file
 from subterra_jax.parts import Part
 from subterra_jax.rules import Start, StopAt, Traverse
 from tests.train.conftest import SMALL, call
+from train.config import TrainConfig
+from train.setup import make_learner
+from train.world import open_world
 
 pytestmark = pytest.mark.door
 
@@ -166,6 +169,15 @@ def test_a_policy_is_trained_on_a_task_reward_and_sensor_from_outside(desk, task
     assert lines[-1][term] < 0.0
     agent, _ = policies.load("run")
     assert agent.layout.shape.n_inputs == 42  # of a plain task 41: the file's own number is read too
+
+
+def test_a_trainer_takes_a_task_reward_and_sensor_from_outside(desk):
+    (desk / "hurry.py").write_text(HURRY)
+    world = open_world("hurry.py:Mine/Hurry-v1", "control")
+    learner = make_learner(world, TrainConfig(n_envs=4, unroll=8, minibatches=2, hidden=(8,)))
+    assert learner.driver.layout.shape.n_inputs == 42
+    state = jax.eval_shape(learner.init, jax.random.PRNGKey(0), world.params)
+    assert "reward_hurry" in jax.eval_shape(learner.iterate, state, world.params)[1].metrics
 
 
 class Twice(Part):
