@@ -54,7 +54,7 @@ def frame_of(direction: Float[np.ndarray, "3"]) -> tuple[Float[np.ndarray, "3"],
     """Return the horizontal vector to the left of a direction, and the one above it."""
     left = np.array([-direction[1], direction[0], 0.0])
     left /= max(float(np.linalg.norm(left)), 1e-9)
-    (x, y, z), (a, b, c) = direction, left  # `np.cross` takes ten times as long, and this is asked for ten thousand times
+    (x, y, z), (a, b, c) = direction, left  # `np.cross` takes ten times as long
     return left, np.array([y * c - z * b, z * a - x * c, x * b - y * a])
 
 

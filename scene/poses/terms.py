@@ -54,8 +54,8 @@ class NormalEquations:
 
     def __init__(self, n: int, size: int, reach: int) -> None:
         self.size, self.reach = size, reach
-        # scipy's lower form: entry (row, column) lies at [row - column, column].
-        self._band = np.zeros((size * (reach + 1), n * size))
+        # By the distance between two knots and the earlier one; of a knot with itself the lower half counts.
+        self._blocks = np.zeros((reach + 1, n, size, size))
         self._right = np.zeros(n * size)
         self.cost = 0.0
 
@@ -81,12 +81,23 @@ class NormalEquations:
 
     def _block(self, row: np.ndarray, column: np.ndarray, left: np.ndarray, right: np.ndarray) -> None:
         block = np.einsum("mra,mrb->mab", left, right)
-        a, b = np.arange(self.size)[:, None], np.arange(self.size)[None, :]
-        below = self.size * (row - column)[:, None, None] + a - b
-        at = self.size * column[:, None, None] + b
-        lower = below >= 0
-        place = (below * self._band.shape[1] + at)[lower]
-        self._band += np.bincount(place, block[lower], self._band.size).reshape(self._band.shape)
+        blocks = self._blocks.reshape(-1, self.size, self.size)
+        place = (row - column) * self._blocks.shape[1] + column
+        if len(np.unique(place)) == len(place):
+            blocks[place] += block
+        else:
+            more = np.zeros_like(blocks)
+            np.add.at(more, place, block)
+            blocks += more
+
+    def _lower_band(self) -> np.ndarray:
+        """Return the matrix in scipy's lower form: entry (row, column) lies at [row - column, column]."""
+        reach, n, size = self._blocks.shape[:3]
+        rows = self._blocks.transpose(0, 2, 1, 3).reshape(reach * size, n, size)
+        band = np.zeros_like(rows)
+        for k in range(size):
+            band[: len(rows) - k, :, k] = rows[k:, :, k]
+        return band.reshape(len(rows), n * size)
 
     def _gradient(self, knot: np.ndarray, jacobian: np.ndarray, residual: np.ndarray) -> None:
         place = self.size * knot[:, None] + np.arange(self.size)
@@ -98,7 +109,7 @@ class NormalEquations:
 
         `damping` is the fraction of the diagonal added to it (Levenberg-Marquardt).
         """
-        band = self._band.copy()
+        band = self._lower_band()
         band[0] *= 1.0 + damping
         try:
             return solveh_banded(band, self._right, lower=True, overwrite_ab=True).reshape(-1, self.size)
