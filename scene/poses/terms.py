@@ -80,15 +80,10 @@ class NormalEquations:
             self._gradient(second, jacobian_second, residual)
 
     def _block(self, row: np.ndarray, column: np.ndarray, left: np.ndarray, right: np.ndarray) -> None:
-        block = np.einsum("mra,mrb->mab", left, right)
-        blocks = self._blocks.reshape(-1, self.size, self.size)
-        place = (row - column) * self._blocks.shape[1] + column
-        if len(np.unique(place)) == len(place):
-            blocks[place] += block
-        else:
-            more = np.zeros_like(blocks)
-            np.add.at(more, place, block)
-            blocks += more
+        place, where = np.unique((row - column) * self._blocks.shape[1] + column, return_inverse=True)
+        total = np.zeros((len(place), self.size, self.size))
+        np.add.at(total, where, np.einsum("mra,mrb->mab", left, right))
+        self._blocks.reshape(-1, self.size, self.size)[place] += total
 
     def _lower_band(self) -> np.ndarray:
         """Return the matrix in scipy's lower form: entry (row, column) lies at [row - column, column]."""
