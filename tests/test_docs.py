@@ -215,7 +215,7 @@ def test_the_site_loads_nothing_from_elsewhere(site: Path):
 def test_tables_and_lists_of_the_pages_are_laid_out(site: Path):
     for page in site.rglob("*.html"):
         text = re.sub(r"<!-- records\n.*?-->", "", page.read_text(), flags=re.DOTALL)  # templates of tables
-        for left in ("<p>| ", "\n| ", "|---", "<br>- ", "<p>- "):
+        for left in ("<p>| ", "\n| ", "|---", "<br>- ", "<p>- ", "</div>\n- "):
             assert left not in text, f"{page.relative_to(site)}: {left!r}; a blank line is missing before it"
 
 
