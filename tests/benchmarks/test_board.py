@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from benchmarks.records import read_records
 from subterra_jax.baselines import registry
 from subterra_jax.episode import Driver
 from subterra_jax.evaluation import harness
+from subterra_jax.evaluation.floor import floor
 
 SPLITS = ("val", "test-unseen")
 PLANAR = roster.PLANAR
@@ -249,3 +251,10 @@ def test_a_batch_takes_no_more_than_the_memory_that_it_may_unless_it_is_one_epis
         found = harness.fitting_batch(env, params, agent, 64, 1e-9 * fraction * many)
         assert least <= found <= most
         assert found == 1 or line(found) <= fraction * many
+
+
+def test_a_task_without_slip_or_to_cover_the_tunnel_has_no_floor():
+    _, params = st.make("Subterra/StopAtShort-v1", tunnel="control")
+    assert drive.floors_of(params, 1) == [round(floor(params, 0), 4)]
+    plain = SimpleNamespace(goal_kind=params.goal_kind, parts={})
+    assert drive.floors_of(plain, 1) is drive.floors_of(st.make("Subterra/TraverseShort-v1", "control")[1], 1) is None

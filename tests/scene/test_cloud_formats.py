@@ -17,7 +17,7 @@ from scene.errors import RecordingError
 from scene.poses.place import register_scans
 from scene.poses.trajectory import Trajectory
 from scene.progress import Stages
-from scene.reading.cloudfile import read_cloud
+from scene.reading.cloudfile import measure_rounding, read_cloud
 from scene.reading.formats import ReadingConfig
 from scene.reading.recording import Recording
 from scene.reading.source import choose_frame
@@ -346,3 +346,9 @@ def test_a_mean_of_nothing_is_an_empty_cloud():
     empty = VoxelMean(0.05).cloud()
     assert (empty.points.shape, empty.weights.shape, empty.origin.tolist()) == ((0, 3), (0,), [0.0, 0.0, 0.0])
     assert (empty.returns, empty.voxel, empty.intensity) == (0, 0.05, None)
+
+
+def test_each_axis_of_a_cloud_has_its_own_rounding():
+    rng = np.random.default_rng(0)
+    points = np.column_stack([0.5 * rng.integers(0, 20, 4000), 0.25 * rng.integers(0, 40, 4000), rng.normal(size=4000)])
+    assert measure_rounding(points) == (0.5, 0.25, 0.0)

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from scene.survey import simulate
 from scene.survey.alignment import draw_railway, lay_out
-from scene.survey.cast import PULSE, Caster, Hits, Loaded, draw_returns, mix_pixels, noise_sigma
+from scene.survey.cast import PULSE, Caster, Hits, Loaded, draw_returns, mix_pixels
 from scene.survey.config import SensorErrors, SurveyConfig
 from scene.survey.lidar import Lidar, avia, os1, vlp16
 from scene.survey.mesh import Mesh, Part
@@ -85,19 +85,6 @@ def test_surfaces_further_apart_than_a_pulse_do_not_mix() -> None:
     reported = mix_pixels(np.random.default_rng(0), os1(), 1.0, walls, back, ray, seen)
     np.testing.assert_array_equal(reported, seen.distance)
     assert (FAR - NEAR) / NEAR * np.hypot(NEAR, 20.0) > PULSE
-
-
-def test_range_noise_grows_with_range_and_incidence() -> None:
-    def sigma(distance: float, cosine: float) -> float:
-        one = [np.array([v], np.float32) for v in (distance, cosine)]
-        return float(noise_sigma(SensorErrors(), *one)[0])
-
-    assert sigma(0.0, 1.0) == pytest.approx(0.019)
-    assert sigma(50.0, 1.0) == pytest.approx(np.hypot(0.019, 0.005))
-    assert sigma(0.0, np.sqrt(0.5)) == pytest.approx(np.hypot(0.019, 0.002))
-    # The tangent stops at 10.
-    assert sigma(0.0, 0.01) == sigma(0.0, 0.05) == pytest.approx(np.hypot(0.019, 0.02))
-    assert noise_sigma(SensorErrors(), np.full(1, np.inf, np.float32), np.zeros(1, np.float32))[0] < 0.03
 
 
 @pytest.mark.parametrize("lidar", [avia(), vlp16(), os1()], ids=lambda lidar: lidar.name)

@@ -111,11 +111,12 @@ def test_an_episode_is_what_it_was(task, request):
 
 
 @pytest.mark.parametrize("task", ["Return"], indirect=True)
-@pytest.mark.parametrize("name", ["fused", "scan-matching"])
+@pytest.mark.parametrize("name", ["fused", "scan-matching", "Return-locate"])
 def test_an_agent_thinks_what_it_thought(task, name):
     """Commands and memories of the baselines on one way, of which they do not choose the commands."""
     env, params, reset, step = task
-    agent, said = make_agent(name, params), []
+    agent = st.load_policy(name, env, params).agent if name == "Return-locate" else make_agent(name, params)
+    said = []
     act = jax.jit(lambda key, memory, flat: agent.act(key, memory, observed(env, params, flat), params, None))
     obs, state = reset(jax.random.key(3), params)
     memory = agent.begin(jax.random.key(4), observed(env, params, obs), params)

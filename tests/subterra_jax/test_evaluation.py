@@ -18,16 +18,19 @@ from subterra_jax.baselines.agent import Agent, Observed
 from subterra_jax.baselines.cloud import CloudParams
 from subterra_jax.baselines.histogram import HistogramLocaliser
 from subterra_jax.baselines.registry import AgentError, make_agent, register
-from subterra_jax.evaluation import Records, evaluate, listed_episodes
+from subterra_jax.evaluation import Episodes, Records, evaluate, listed_episodes
 from subterra_jax.evaluation import episodes as lists
 from subterra_jax.evaluation.episodes import EvaluationError
 from subterra_jax.evaluation.floor import is_above
 from subterra_jax.evaluation.records import (
+    EstimateTally,
+    Tally,
     add_estimate,
     add_step,
     area,
     crps,
     interval,
+    make_records,
     start_estimates,
     start_tally,
     summarise,
@@ -272,3 +275,25 @@ def test_it_finds_out_where_it_is():
     env, params = st.make("Subterra/Relocalise-v1", tunnel="subterra-351", estimates=True)
     records = evaluate(env, params, open_agent(histogram.NAME, env, params), listed_episodes(env, params, 4), 4)
     assert records.success.all()
+
+
+def test_figures_of_an_episode_follow_from_its_sums():
+    """Two episodes of 10 and 20 steps of 0.1 s; the estimate of the second is off at the last step."""
+    n = lambda *values: np.array(values)  # noqa: E731
+    estimates = EstimateTally(n(0.5, -2.0), n(40.0, 80.0), n(5.0, 4.0), n(20.0, 10.0), n(9, 20))
+    tally = Tally(
+        steps=n(10, 20), travelled=n(8.0, 20.0), way=n(6.0, 25.0), offset=n(1.0, 5.0), lateral_square=n(2.5, 5.0),
+        jerk=n(2.0, 3.0), clearance=n(0.3, 0.4), success=n(True, False), contact=n(False, True),
+        goal_error=n(0.1, 9.0), coverage=n(0.5, 0.7), progress=n(0.6, 0.8), over=n(True, True), estimates=estimates,
+    )  # fmt: skip
+    episodes = Episodes(*(np.zeros(2, np.int32) for _ in range(4)))
+    params = SimpleNamespace(vehicle=SimpleNamespace(period=0.1))
+    found = make_records(tally, episodes, SimpleNamespace(rule=SimpleNamespace(goal_kind="stop")), params)
+    expected = {
+        "spl": (0.75, 0.0), "contacts_per_100m": (0.0, 5.0), "offset": (0.1, 0.25), "lateral": (0.5, 0.5),
+        "time": (1.0, 2.0), "jerk": (0.2, 0.15), "axial_final": (0.5, -2.0), "axial_rms": (2.0, 2.0),
+        "drift": (6.25, 10.0), "time_to_lock": (0.9, np.nan), "crps": (0.5, 0.2), "nees": (2.0, 0.5),
+        "coverage": (np.nan, np.nan), "progress": (np.nan, np.nan),
+    }  # fmt: skip
+    for name, values in expected.items():
+        np.testing.assert_allclose(getattr(found, name), values, err_msg=name)

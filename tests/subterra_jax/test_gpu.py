@@ -2,6 +2,7 @@
 
 import dataclasses
 from functools import partial
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -185,3 +186,10 @@ def test_a_step_of_a_batch_launches_two_kernels_of_ours_and_draws_in_two_calls(m
 def test_a_range_that_is_no_number_is_wrong(plan: st.TunnelPlan) -> None:
     poses = reference.random_poses(plan, 4, np.random.default_rng(6))
     assert reference.agreement(plan.lining("pockets").segments, poses, np.full((4, 16), np.nan)).n_wrong == 64
+
+
+@pytest.mark.parametrize(("backend", "kind"), [("gpu", "NVIDIA H100"), ("gpu", "AMD MI300"), ("cpu", "NVIDIA H100")])
+def test_the_first_device_tells_whether_the_kernels_fit(monkeypatch, backend, kind):
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    monkeypatch.setattr(jax, "devices", lambda: [SimpleNamespace(device_kind=kind)])
+    assert kernels.on_nvidia() == ((backend, kind) == ("gpu", "NVIDIA H100"))

@@ -8,10 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import struct
 
 import subterra_jax as st
 from subterra_jax.baselines.agent import Observed
-from subterra_jax.baselines.stations import Driven
+from subterra_jax.baselines.stations import Driven, Station
 from subterra_jax.baselines.steering import Corridor
 from subterra_jax.policies import PolicyError, check_fits, from_tensors, training_conditions
 from subterra_jax.policies.locate import bends, map_filter, matching, memory, streams
@@ -176,6 +177,30 @@ def _way(ways, driven, direction, flagged, now, params):
     obs = Observed(ranges, ranges, distance=jnp.float32(driven), heading=jnp.zeros(()), goal=jnp.float32(63.0))
     step = Driven(jnp.float32(2.0), jnp.ones(()), jnp.float32(direction), jnp.asarray(flagged), walls)
     return ways.update(now, obs, step, params, None)
+
+
+@struct.dataclass
+class Begun:
+    begin: jax.Array
+
+
+class Still:
+    """A localiser that has counted 7 m from 50 m on."""
+
+    def begin(self, obs, params):
+        return Begun(jnp.float32(50.0))
+
+    def update(self, before, obs, driven, params, known):
+        return Station(jnp.float32(57.0), jnp.zeros(()), jnp.ones(())), before
+
+
+@pytest.mark.parametrize(("flagged", "station", "sigma"), [(True, 61.1, 0.1), (False, 57.0, 1.0)])
+def test_a_flag_that_is_told_moves_the_count_to_a_tenth_of_a_metre_behind_its_place(flagged, station, sigma):
+    goal, vehicle = SimpleNamespace(flag_reach=2.0), SimpleNamespace(period=0.1)
+    ways, params = TwoWays(Still()), SimpleNamespace(goal=goal, vehicle=vehicle)
+    estimate, _ = _way(ways, 7.0, 1.0, flagged, ways.begin(None, params), params)
+    assert float(estimate.station) == pytest.approx(station, abs=1e-5)
+    assert float(jnp.exp(estimate.log_sigma)) == pytest.approx(sigma, abs=1e-6)
 
 
 def test_a_way_back_begins_at_the_place_that_the_flag_tells():

@@ -8,6 +8,7 @@ import pytest
 
 import subterra_jax as st
 from subterra_jax.b2.model import robot_spec
+from subterra_jax.baselines.registry import make_agent, names
 from subterra_jax.host.rover import rover_mjcf
 from subterra_jax.physics.ground import read_track
 from subterra_jax.physics.stage import tunnel_world
@@ -48,3 +49,9 @@ MODELS = {
 @pytest.mark.parametrize("name", MODELS)
 def test_a_model_for_mujoco_is_what_it_was(name):
     check(TABLE, name, arrays_of(MODELS[name]().compile()))
+
+
+@pytest.mark.parametrize("task", ["StopAt", "Relocalise", "Faulted"])
+def test_agents_are_set_as_they_were(task):
+    _, params = st.make(f"Subterra/{task}-v1", "control")
+    check(TABLE, f"agents {task}", {name: make_agent(name, params) for name in names()})

@@ -3,16 +3,20 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from rosbags.rosbag1 import Reader
 
+from benchmarks.fidelity.derive import beams, distances
+from benchmarks.fidelity.derive.curve import Curve
 from benchmarks.fidelity.files import FidelityError
 from benchmarks.fidelity.inputs import (
     GUARD,
     Inputs,
     SplitConfig,
+    _shown_metres,
     check_length,
     check_recording,
     complete_inputs,
@@ -136,3 +140,17 @@ def test_a_recording_shorter_than_five_blocks_is_refused(tmp_path: Path) -> None
         with pytest.raises(SubterraError, match=r"block|fractions"):
             split_recording(short, tmp_path / "parts", wrong)
     assert not (tmp_path / "parts").exists()
+
+
+def test_a_metre_is_shown_by_thirty_returns_near_the_axis_and_not_by_one_less() -> None:
+    line = Curve.through(np.column_stack([np.arange(0.0, 4.1, 0.5), np.zeros((9, 2))]))
+    number = np.array([30, 29, 31, 30])
+    place = np.column_stack([np.repeat(np.arange(4) + 0.5, number), np.zeros((number.sum(), 2))])
+    place[-1, 1] = 9.0  # too far aside
+    assert _shown_metres(line, SimpleNamespace(points=place), 5.0).tolist() == [True, False, True, False]
+
+
+def test_of_a_long_recording_returns_evenly_spaced_in_time_are_measured(monkeypatch) -> None:
+    monkeypatch.setattr(beams, "returns", lambda case: SimpleNamespace(range=np.zeros(360_000)))
+    rows = distances.thinned_rows(SimpleNamespace(hold=SimpleNamespace(cache={}), seed=0))
+    assert (len(rows), rows[0], rows[-1], set(np.diff(rows))) == (120_000, 0, 359_999, {2, 3, 4} & set(np.diff(rows)))

@@ -4,6 +4,7 @@ import csv
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -136,6 +137,17 @@ def test_all_forms_are_written_and_agree(tmp_path: Path) -> None:
     assert 'src="http' not in page
     assert "N24" in (tmp_path / "controls.csv").read_text()
     assert not list((tmp_path / "figures").iterdir())  # nothing to draw without a reference
+
+
+@pytest.mark.parametrize(("id", "said"), [("gauge", "12 mm (limit 10)"), ("wall", "1.2 cm (limit 1)")])
+def test_a_worst_place_is_written_in_the_unit_of_its_kind(id: str, said: str) -> None:
+    row = {"id": id, "words": id, "where": "", "value": 0.012, "limit": 0.01, "start": 4.0, "end": 6.0, "unit": "m"}
+    report = {"windows": {"worst": [{**row, "source": "truth", "beyond": True}]}}
+    sheet = SimpleNamespace(case=tube.case(), report=report, note=lambda *_: "")
+    drawn = figures.draw_worst_places(sheet)
+    assert drawn is not None
+    assert f"{id}\n{said}, station 4 to 6 m, truth" in drawn[0].axes[0].get_title()
+    figures.plt.close(drawn[0])
 
 
 def test_a_figure_that_cannot_be_drawn_costs_no_other(
