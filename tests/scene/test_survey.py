@@ -10,7 +10,7 @@ from rosbags.rosbag1 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
-from tests.scene.surveyed import Cast, Trajectory, frames, load_cast, load_trajectory, read_tum, survey
+from tests.scene.surveyed import Cast, Trajectory, load_cast, load_trajectory, read_tum, survey
 
 LENGTH, POINTS, EPOCH = 14.0, 2_400, 1_700_000_000
 POINT = np.dtype([("t", "<u4"), ("xyz", "<f4", 3), ("reflectivity", "u1"), ("tag", "u1"), ("line", "u1")])
@@ -94,19 +94,6 @@ def test_returns_lie_on_the_truth_within_the_range_noise(bag: Bag, trajectory: T
     assert np.median(abs(error)) == pytest.approx(0.6745 * 0.02, abs=3e-4)
     assert error[close].std() == pytest.approx(0.02, abs=5e-4)
     assert error[close].mean() == pytest.approx(0.0, abs=3e-4)
-
-
-def test_the_whole_bore_is_seen_from_mouth_to_mouth(truth: dict, bag: Bag, trajectory: Trajectory) -> None:
-    seen = (bag.points["xyz"] != 0).any(axis=2)
-    time = (EPOCH + 0.1 * np.arange(len(seen))[:, None] + 1e-9 * bag.points["t"])[seen]
-    place, attitude = trajectory.at(time)
-    cloud = place + attitude.apply(bag.points["xyz"][seen])
-    position, tangent, lateral, up = frames(truth)
-    for i in range(0, len(position) - 1, 2):
-        away = cloud - position[i]
-        near = away[abs(away @ tangent[i] - 0.25) <= 0.25]
-        turn = np.arctan2(near @ up[i], near @ lateral[i])
-        assert np.histogram(turn, 18, (-np.pi, np.pi))[0].min() >= 4, truth["station"][i]
 
 
 def test_the_prism_is_a_lever_arm_away_from_the_lidar(folder: Path, trajectory: Trajectory) -> None:

@@ -59,17 +59,6 @@ def test_width_and_height_are_what_rays_measure(bare: tuple[Path, dict, Cast]) -
     assert checked > 20
 
 
-def test_the_same_seed_gives_the_same_bytes_and_another_does_not(tmp_path: Path) -> None:
-    one, same, other = (
-        make(tmp_path / n, "--truth", "irregular", "--seed", s) for n, s in (("a", 1), ("b", 1), ("c", 2))
-    )
-    names = sorted(p.name for p in one.iterdir())
-    assert names == ["prism.tum", "truth.json", "truth.ply"]
-    for name in names:
-        assert (one / name).read_bytes() == (same / name).read_bytes()
-        assert (one / name).read_bytes() != (other / name).read_bytes()
-
-
 @needs_metro
 def test_the_metro_alignment_follows_the_real_ring_centres() -> None:
     rows = np.genfromtxt(METRO / "export_best_fit_result.csv", delimiter=",", names=True)

@@ -8,7 +8,6 @@ import pytest
 import subterra_jax as st
 from benchmarks import reference
 from subterra_jax.procedural import expand, open_world
-from subterra_jax.procedural.bore import draw_bore
 from subterra_jax.procedural.kinds import KINDS
 from subterra_jax.procedural.open_world import HELD_OUT, SPLITS, draw, kinds_of, levels_of, plan
 from subterra_jax.procedural.surfaces import Grid, Stretches, Waves
@@ -69,21 +68,6 @@ def test_a_task_longer_than_its_tunnel_is_refused_with_both_lengths():
     short = plan(name_of("cast"), solid=False, length=40.0)
     with pytest.raises(ValueError, match=r"needs a tunnel of 140 m, this one has 40\.0 m"):
         st.make("Subterra/StopAt-v1", tunnel=short)
-
-
-def test_nothing_is_placed_where_a_sensor_looks():
-    """Another mount leaves every pocket and box in its place, and a plane meets a row of pockets only now and then."""
-    met = []
-    for i in range(30):
-        streams = lambda mount, i=i: [np.random.default_rng([i, k]) for k in (0, 1, 2, 3, mount)]  # noqa: E731
-        one, two = (draw_bore(KINDS["straight"], 40.0, ("cabinet", "bracket"), streams(mount)) for mount in (4, 5))
-        assert one.mount != two.mount
-        np.testing.assert_array_equal(one.pocket, two.pocket)
-        for a, b in zip(vars(one.furniture).values(), vars(two.furniture).values(), strict=True):
-            np.testing.assert_array_equal(a, b)
-        plane = one.mount.plane(np.where(np.cos(one.pocket[:, 1]) > 0.0, 1.0, -1.0) * one.section.half_width)
-        met.append(np.any(np.abs(one.heights_of(one.pocket) - plane) < 0.05))
-    assert 3 <= np.sum(met) <= 24
 
 
 def test_a_random_surface_has_its_standard_deviation_and_correlation_length_both_ways():
