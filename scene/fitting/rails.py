@@ -118,7 +118,9 @@ def _find_pairs(points: LowPoints, narrow: int) -> list[SeenRails]:
     usual_top = float(np.median(highest_of[np.isfinite(highest_of)]))
     highest = np.abs(top - usual_top) < _CANT / 2  # sleepers half in shadow look like rails, but lie lower
     window, middle, apart = window[highest], middle[highest], apart[highest]
-    usual = _most_frequent(apart)
+    often, places = np.histogram(apart, np.arange(_APART[0] - 0.1, _APART[1] + 0.1, 0.01))
+    best = places[np.convolve(often, np.ones(5), mode="same").argmax()] + 0.005  # the most frequent distance
+    usual = float(np.median(apart[np.abs(apart - best) < _ALIKE]))
     alike = np.abs(apart - usual) < _ALIKE
     tracks = []
     for rows in _follow(window[alike], middle[alike]):
@@ -175,12 +177,6 @@ def _pairs_of(middle: np.ndarray, top: np.ndarray) -> list[tuple[float, float, f
         (float(middle[i] + middle[j]) / 2, float(middle[j] - middle[i]), float(top[i] + top[j]) / 2)
         for i, j in zip(a, b, strict=True)
     ]
-
-
-def _most_frequent(apart: np.ndarray) -> float:
-    count, edges = np.histogram(apart, np.arange(_APART[0] - 0.1, _APART[1] + 0.1, 0.01))
-    best = edges[np.convolve(count, np.ones(5), mode="same").argmax()] + 0.005
-    return float(np.median(apart[np.abs(apart - best) < _ALIKE]))
 
 
 def _follow(window: np.ndarray, middle: np.ndarray) -> list[np.ndarray]:

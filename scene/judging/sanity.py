@@ -317,14 +317,11 @@ def doubt_track(track: Track, seen: SeenTrack, pose_doubt: str | None = None) ->
     count, measured = len(track.measured), int(track.measured.sum())
     if not count or measured >= _FEW * count:
         return []
+    lines = [line.sleeper_station for line in track.lines if len(line.sleeper_station) > 1]
+    spacing = sum(line[-1] - line[0] for line in lines) / max(sum(len(line) - 1 for line in lines), 1)
     observed = "none of them was seen" if not measured else f"only {measured} of them were seen"
     return [Warned(
         Code.SLEEPERS,
-        f"{count} sleepers lie where a spacing of {_spacing(track):.2f} m asks for them, and {observed}: the returns "
+        f"{count} sleepers lie where a spacing of {spacing:.2f} m asks for them, and {observed}: the returns "
         "between the rails are too few, or lie too even, to tell them; --track none leaves the track out",
     )]  # fmt: skip
-
-
-def _spacing(track: Track) -> float:
-    lines = [line.sleeper_station for line in track.lines if len(line.sleeper_station) > 1]
-    return float(sum(line[-1] - line[0] for line in lines) / max(sum(len(line) - 1 for line in lines), 1))

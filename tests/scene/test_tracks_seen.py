@@ -272,7 +272,7 @@ def test_a_cloud_too_thin_to_show_rails_or_blurred_by_its_poses_says_so():
 
 def test_three_pieces_of_which_two_agree_by_chance_make_no_gauge():
     gauges = np.array([1.4105, 1.4233, 1.4234])
-    assert rails_seen._robust_spread(gauges) > rails_seen._PIECES_AGREE
+    assert rails_seen._robust_spread(gauges) > rails_seen._STRETCHES_AGREE
 
 
 def test_single_returns_show_a_gauge_that_means_of_voxels_widen(simulated):
