@@ -177,3 +177,8 @@ def test_a_page_refers_to_nothing_outside_itself():
     assert "A &amp; B" in text
     assert "x &lt; y" in text
     assert '<tr class="missed">' in text
+
+
+def test_a_figure_of_the_demo_s_report_is_scaled_to_its_unit():
+    for row in report._ROWS:
+        assert row.factor == {"cm": 100, "%": 100, "million": 1e-6}.get(row.unit, 1.0), row

@@ -48,7 +48,11 @@ MODELS = {
 
 @pytest.mark.parametrize("name", MODELS)
 def test_a_model_for_mujoco_is_what_it_was(name):
-    check(TABLE, name, arrays_of(MODELS[name]().compile()))
+    model = MODELS[name]().compile()
+    looks = {name: getattr(model, name) for name in ("geom_type", "geom_rgba", "geom_group", "mat_rgba", "light_pos")}
+    check(
+        TABLE, name, looks if name == "picture" else arrays_of(model)
+    )  # its triangles differ from one processor to another
 
 
 @pytest.mark.parametrize("task", ["StopAt", "Relocalise", "Faulted"])

@@ -2,13 +2,15 @@
 
 from dataclasses import replace
 from functools import cache, partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import trimesh
 
+from benchmarks.fidelity.categories import space
 from benchmarks.fidelity.derive.curve import Curve
-from benchmarks.fidelity.derive.freespace import air_voxels
+from benchmarks.fidelity.derive.freespace import air_voxels, reachable
 from benchmarks.fidelity.derive.ground import judged_ground, judged_route
 from benchmarks.fidelity.derive.mesh import Grid, persistence_diagrams
 from tests.benchmarks.fidelity import tube
@@ -177,3 +179,19 @@ def test_persistence_of_a_box_with_a_floating_block_is_known():
     zero, _, two = persistence_diagrams(grid.clearance(occupied))
     assert np.isinf(zero[:, 1]).sum() == 1
     assert (two[:, 1] - two[:, 0] > 1.0).sum() == 1
+
+
+@pytest.mark.parametrize(("nearest", "free"), [(0.15, 0.0), (0.25, 1.0)])
+def test_a_sensor_is_in_the_air_from_twenty_centimetres_off_any_surface_on(monkeypatch, nearest, free):
+    surface = SimpleNamespace(query=lambda at: (np.full(len(at), nearest), None, None))
+    monkeypatch.setattr(space, "surface_nearest", lambda case: surface)
+    assert measure("free3d_hold_poses_free", replace(judged(), cache={})).value == free
+
+
+@pytest.mark.parametrize(("width", "counts"), [(2, False), (4, True)])
+def test_air_at_a_mouth_counts_from_a_tenth_of_the_largest_part_on(width, counts):
+    free = np.zeros((12, 40, 3), bool)
+    free[:, :30] = free[:, 31 : 31 + width] = True
+    found = reachable(free)
+    assert found[:, :30].all()
+    assert found[:, 31 : 31 + width].all() == counts

@@ -1,5 +1,6 @@
 """Every control does to the geometry what its row says."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -211,3 +212,9 @@ def test_nails_are_seen_move_with_the_pattern_and_go_with_their_pockets(base: Ca
     assert len(candidate(nailed, "N26", 2).nails.faces) == len(nail.faces)
     along = (candidate(nailed, "N26", 3).nails.centroid - nail.centroid) @ bore.tangent[row]
     assert abs(along) > 0.2
+
+
+def test_a_mesh_keeps_corners_a_millimetre_apart_on_its_way_through_other_formats(base: Case) -> None:
+    small = replace(base.candidate, lining=trimesh.creation.box((1e-3, 1e-3, 1e-3)))
+    sent = put_in(Site(replace(base, candidate=small, cache={})), Fault("exchanged"))
+    assert len(sent.candidate.lining.vertices) == 8

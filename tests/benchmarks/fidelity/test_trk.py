@@ -9,8 +9,11 @@ import pytest
 from benchmarks.fidelity import table
 from benchmarks.fidelity.candidate import load_candidate
 from benchmarks.fidelity.case import Case
+from benchmarks.fidelity.derive import track
 from benchmarks.fidelity.derive.scene import rays_from_axis
 from benchmarks.fidelity.derive.track import hold_railway
+from benchmarks.fidelity.faults.mesh import scale_scene
+from subterra_jax.host.tunnelfile import read_fields
 from tests.benchmarks.fidelity import tube, tubescene
 from tests.benchmarks.fidelity.judged import SHORT, against, measure
 
@@ -177,3 +180,20 @@ def test_what_does_not_change_is_not_computed_again(good, monkeypatch):
     before = measure("mj_wall_contact_err", good).value
     monkeypatch.setattr("benchmarks.fidelity.derive.contact.Probe", None)
     assert measure("mj_wall_contact_err", good).value == before
+
+
+def test_a_sleeper_is_as_high_as_most_of_its_returns():
+    station = np.repeat(np.arange(0.0, 6.0, track._PROFILE_BIN) + 1e-6, 9)
+    on = (station + 0.1) % 0.6 < 0.2
+    lost = np.tile(np.arange(9) < 4, len(station) // 9)  # four of nine returns of a sleeper come from beside it
+    found, rise = track._find_sleepers(station, np.where(on, np.where(lost, -0.1, 0.06), 0.0))
+    assert rise == pytest.approx(0.06)
+    np.testing.assert_allclose(np.diff(found), 0.6, atol=0.03)
+
+
+def test_a_scaled_scene_has_its_files_and_its_planar_tunnel_scaled(good, tmp_path):
+    scaled = scale_scene(good.candidate, 1.05, tmp_path)
+    before, after = (read_fields(one.tunnel) for one in (good.candidate, scaled))
+    for name in ("station", "half_width", "lidar_height"):
+        np.testing.assert_allclose(after[name], 1.05 * np.asarray(before[name]))
+    assert (scaled.folder / "meshes" / "lining.ply").exists()
