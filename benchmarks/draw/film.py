@@ -188,13 +188,10 @@ def wall_lines(drawn: Drawn) -> list[Float[np.ndarray, "n 2"]]:
     """Returns the walls in the plane of the LiDAR as lines, tunnel frame, m, furniture and boxes too."""
     plan = drawn.centreline.plan
     lining = plan.lining(plan.default_lining)
-    boxes = [_outline(box[:2], box[2:4], box[4:]) for box in drawn.boxes.astype(np.float64)]
+    corner = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1], [1, 1]])
+    boxes = [box[:2] + (corner * box[4:]) @ np.array([box[2:4], [-box[3], box[2]]])
+             for box in drawn.boxes.astype(np.float64)]  # fmt: skip
     return [lining.left.vertex, lining.right.vertex, *lining.furniture.reshape(-1, 2, 2), *boxes]
-
-
-def _outline(middle: np.ndarray, axis: np.ndarray, half: np.ndarray) -> Float[np.ndarray, "5 2"]:
-    corner = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1], [1, 1]]) * half
-    return middle + corner @ np.array([axis, [-axis[1], axis[0]]])
 
 
 def _strip(axes: Axes, drawn: Drawn) -> Any:

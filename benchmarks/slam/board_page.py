@@ -51,7 +51,9 @@ def as_markdown(board: dict[str, Any]) -> str:
     rows, names = board["rows"], _held(board)
     head = ["program", "runs", *(_NAMES[name] for name in names), "across, m", "reach, m", "of real time"]
     lines = []
-    for program in sorted(_programs(board), key=lambda one: _rank(rows, one)):
+    drift = {one: np.median([row["drift"] if "failed" not in row else 1e9 for row in rows if row["program"] == one])
+             for one in _programs(board)}  # of all recordings; failures come last  # fmt: skip
+    for program in sorted(drift, key=drift.__getitem__):
         runs = str(sum(row["program"] == program for row in rows))
         lines.append([program, runs, *(_cell(rows, program, name) for name in names),
                       *_sums(rows, program)])  # fmt: skip
@@ -99,11 +101,6 @@ def _failures(rows: list[Row]) -> list[str]:
         if "failed" in row:
             sets.setdefault(f"{row['program']} on {row['recording']}: {row['failed']}", []).append(row["set"])
     return [f"{text} ({', '.join(names)})" for text, names in sets.items()]
-
-
-def _rank(rows: list[Row], program: str) -> float:
-    """Returns the median drift over all recordings; failures come last."""
-    return float(np.median([row["drift"] if "failed" not in row else 1e9 for row in rows if row["program"] == program]))
 
 
 def _cell(rows: list[Row], program: str, recording: str) -> str:

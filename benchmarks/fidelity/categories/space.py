@@ -99,14 +99,11 @@ def free2d_edt_rmse(case: Case) -> Samples:
     """Root mean square error of the distance to the edge of free space, where either is free, m."""
     judged, reference, rows = plane.gapless_maps(case)
     picked = judged | reference
-    clear = [_edge_distance(free, plane.free_plane(case).lattice.edge) for free in (judged, reference)]
+    edge, clear = plane.free_plane(case).lattice.edge, []
+    for free in (judged, reference):
+        away = plane.cell_distances(np.ones_like(free), ~free, edge) if free.any() else np.zeros(free.shape)
+        clear.append(away.reshape(free.shape))
     return Samples((clear[0] - clear[1])[picked], np.broadcast_to(rows[:, None], picked.shape)[picked])
-
-
-def _edge_distance(free: np.ndarray, edge: float) -> np.ndarray:
-    if not free.any():
-        return np.zeros(free.shape)
-    return plane.cell_distances(np.ones_like(free), ~free, edge).reshape(free.shape)
 
 
 @metric("free2d_skeleton_p95", "F2D", D(0.101, 0.6), "m", needs="reference")

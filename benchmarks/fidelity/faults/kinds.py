@@ -155,8 +155,16 @@ def put_in(site: Site, fault: Fault) -> Case:
 
     Raises:
         KeyError: No such kind.
+        FidelityError: A kind from outside raises, or returns neither.
     """
-    changed = KINDS[fault.kind].change(site, fault)
+    try:
+        changed = KINDS[fault.kind].change(site, fault)
+    except Exception as error:
+        if fault.kind not in outside_kinds():
+            raise
+        raise FidelityError(f"fault {fault.kind!r}: {type(error).__name__}: {error}") from error
+    if not isinstance(changed, Candidate | Case):
+        raise FidelityError(f"fault {fault.kind!r}: returns {type(changed).__name__}, and no Candidate or Case")
     return changed if isinstance(changed, Case) else replace(site.case, candidate=changed, cache={})
 
 

@@ -11,8 +11,10 @@ from benchmarks.fidelity import judge, outside, table
 from benchmarks.fidelity.__main__ import main
 from benchmarks.fidelity.derive.sections import truth_caster
 from benchmarks.fidelity.derive.surface import surface_nearest
+from benchmarks.fidelity.faults import Fault, Site, put_in
 from benchmarks.fidelity.faults.kinds import asked_faults
 from benchmarks.fidelity.faults.runner import Bench, Job, judge_outcomes, list_jobs, run_jobs
+from benchmarks.fidelity.files import FidelityError
 from benchmarks.fidelity.registry import Samples, Value, dump_values, estimate, load_values, mean, number
 from benchmarks.fidelity.table import B, D, Map, P, U, metric
 from tests.benchmarks.fidelity import tube
@@ -51,6 +53,14 @@ def test_a_mistake_in_the_file_is_one_sentence_and_status_2(code: str, tmp_path:
     assert said.startswith(f"error: {file}: ")
     assert MISTAKES[code] in said
     assert "\n" not in said
+
+
+def test_a_fault_from_outside_that_raises_or_returns_nothing_is_named(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(f'{HEAD}fault_kind("a", "a")(print)\nfault_kind("b", "b")(lambda *_: 1 / 0)\n')
+    outside.load_file(tmp_path / "mine.py")
+    for name, why in (("a", "returns NoneType"), ("b", "ZeroDivisionError")):
+        with pytest.raises(FidelityError, match=f"fault '{name}': {why}"):
+            put_in(Site(tube.case()), Fault(name))
 
 
 def test_a_file_that_is_not_there_is_said_so(tmp_path: Path, monkeypatch, capsys) -> None:
