@@ -248,7 +248,9 @@ def _panel(drawn: Drawn, facts: dict[str, str]) -> str:
     """Return the panel beside the scene as HTML: facts, outcome, legend and chart."""
     trace = drawn.trace
     lines = [html.escape(f"{name}: {words}") for name, words in facts.items()]
-    lines.append(f"<b>{trace.ended}</b> after {trace.time[-1]:.1f} s, {drawn.truth.shape[0] - 1} steps")
+    lines.append(
+        f"<b>{trace.ended.split(' after')[0]}</b> after {trace.time[-1]:.1f} s, {drawn.truth.shape[0] - 1} steps"
+    )
     names = [("truth", TRUTH), ("odometry", ODOMETRY), ("LiDAR", _HIT)]
     names += [("estimate ± 2 sd", ESTIMATE)] * bool(np.isfinite(drawn.estimate[1:, 0]).any())
     names += [("goal", _GOAL)] * bool(np.isfinite(drawn.goal))
