@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import functools
 import json
 import shutil
 import sys
@@ -27,6 +28,7 @@ TASK = "Subterra/TraverseShort-v1"
 FACTS = {"task": TASK}
 
 
+@functools.cache
 def policy_of(seed, hidden=16):
     env, params = st.make(TASK)
     driver = Driver(env, make_layout(env, params, TrainConfig(hidden=(hidden,))))
