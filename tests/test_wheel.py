@@ -22,6 +22,17 @@ obs, state, *_ = env.step(jax.random.key(1), state, env.action_space(params).hig
 agent, facts = policies.load("TraverseShort-v1")
 print(obs.shape, agent.name, facts["task"])
 """
+TOUR = """
+import jax, numpy as np
+import subterra_jax as st
+from subterra_jax.parts.spatial_lidar import SENSORS
+for id in st.list_tasks():
+    for sensor in SENSORS if "B2Walk" not in id else SENSORS[:1]:  # it has no LiDAR
+        env, params = st.make(id, **({} if sensor == SENSORS[0] else {"sensor": sensor}))
+        _, state = env.reset(jax.random.key(0), params)
+        obs, *_ = env.step(jax.random.key(1), state, jax.numpy.zeros(getattr(env, "action_size", 12)), params)
+        print(id, sensor, np.isfinite(obs).all())
+"""
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +93,5 @@ def test_the_wheel_alone_loads_a_policy_and_makes_and_steps_every_task_with_ever
     done = subprocess.run([python, "-c", DRIVE], check=True, capture_output=True, text=True, cwd=tmp_path, env=plain)
     assert done.stdout.startswith("(18,) ")
     assert done.stderr == ""
-    tour = [python, "-P", str(ROOT / "tests" / "wheel_tour.py")]  # beside it lies a folder `subterra_jax`
-    done = subprocess.run(tour, check=True, capture_output=True, text=True, cwd=tmp_path, env=plain)
-    print(done.stdout)
-    assert len(done.stdout.splitlines()) == 1 + 9 * 5 + 1
+    done = subprocess.run([python, "-c", TOUR], check=True, capture_output=True, text=True, cwd=tmp_path, env=plain)
+    assert [line.split()[-1] for line in done.stdout.splitlines()] == ["True"] * (9 * 5 + 1)

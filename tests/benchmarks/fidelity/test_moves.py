@@ -124,80 +124,14 @@ edit("stiff contacts", ".", stiffen)
 edit("ellipsoid", "./worldbody/body/geom", put(type="ellipsoid", size="0.3 0.2 0.3"))
 
 
-def control(id: str, dose: float) -> Fault:
-    return load_controls()[id].faults[dose]
+def fault_of(text: str) -> Fault:
+    """A fault of the table: `control; ID; DOSE` or `fault; KIND; SIZE; STATION; EXTENT`."""
+    kind, name, *numbers = text.split("; ")
+    return load_controls()[name].faults[float(numbers[0])] if kind == "control" else Fault(name, *map(float, numbers))
 
 
-MOVES: dict[Fault, str] = {
-    control("N11", 0.5): (
-        "cl_lateral_rmse cl_lateral_p95 cl_heading_rmse cl_icp_rotation nav_path_len_ratio nav_path_dev_p95 "
-    ),
-    Fault("lift", 0.15, 12.0, 10.0): "cl_vertical_rmse cl_grade_rmse",
-    control("N04", 5.0): "cl_length_rel_err cl_end_station_err cl_axial_drift_slope trk_sleeper_spacing_err",
-    control("N10", 100.0): "cl_curvature_rmse",
-    control("N02", 5.0): (
-        "sec_width_bias sec_width_rmse sec_height_bias sec_height_rmse sec_area_rel_err_mean "
-        "sec_area_rel_err_p95 sec_iou_mean sec_iou_p05 sec_overbreak_vol sec_radial_rmse c2m_mean c2m_median "
-        "c2m_rmse c2m_p95 c2m_within_5cm c2m_within_10cm c2m_signed_bias c2m_chainage_worst c2m_sector_worst "
-        "c2m_noise_ratio m3c2_signif_frac comp_10cm fscore_10cm chamfer_l1 comp_chainage_min beam_range_mae "
-        "beam_range_medae beam_range_bias beam_range_p95 beam_within_10cm beam_rel_medae beam_late_frac "
-        "range_ks range_w1 elevation_w1 azimuth_profile_rmse awd c2st_auc occ2d_free_iou occ2d_free_precision "
-        "occ2d_boundary_f1 free2d_area_rel_err free2d_width_mae free2d_width_min_err free2d_edt_rmse "
-        "free3d_iou free3d_volume_rel_err free3d_esdf_rmse free3d_inscribed_err free3d_headroom_rmse "
-        "free3d_envelope_agree vox_iou_norm vox_precision vox_recall vox_kappa vox_proj_iou_xy "
-        "vox_proj_iou_xz vox_proj_iou_yz nav_traversable_iou "
-    ),
-    Fault("tube", 2): (
-        "sec_underbreak_vol sec_variation_corr sec_variation_ratio beam_early_frac tri_edge_p95 "
-        "nav_clearance_min_err nav_clearance_mean_err nav_step_p95_err lin_depth_map_ncc lin_pocket_f1 "
-        "lin_pocket_count_rel_err lin_axial_pitch_err lin_circ_pitch_err lin_ring_phase_err trk_sleeper_f1 "
-        "trk_sleeper_count_rel_err "
-    ),
-    control("N32", 2.0): (
-        "c2m_fit_hold_gap beam_return_bacc incidence_w1 noise_sigma_diff mme_diff vox_f1_tol1 "
-        "vox_interior_mismatch vox_chainage_min_f1 deg_rot_info_logratio deg_profile_corr deg_alias_diff "
-    ),
-    control("N20", 2.0): (
-        "fscore_20cm hausdorff_p99 extra_surface_frac topo_body_count_err topo_chi_err topo_genus "
-        "topo_free_b0 topo_bottleneck_h0 topo_floater_area free2d_skeleton_p95 free3d_false_occupied "
-        "free3d_hold_poses_free nav_path_exists nav_feasible_agree nav_blocked_diff deg_axial_info_logratio "
-        "deg_cond_logratio deg_eig_w1 deg_landmark_diff "
-    ),
-    control("N09", 10.0): "missing_surface_frac",
-    control("N28", 1.0): "dropout_diff",
-    Fault("unfinite"): "mesh_finite",
-    control("N16", 2.0): (
-        "mesh_watertight mesh_winding_consistent mesh_is_volume mesh_manifold_status mesh_boundary_unexpected "
-        "mesh_nonmanifold_edges mesh_duplicate_faces mesh_self_intersections tri_sliver_frac topo_mouth_err "
-    ),
-    control("N14", 1.0): "mesh_orientation_frac",
-    Fault("flattened"): "mesh_degenerate_faces",
-    Fault("swollen"): "mesh_volume_vs_sections",
-    Fault("doubled", 0.2): "tri_aspect_p95 tri_min_angle_p05",
-    Fault("spanned"): "tri_chord_error_max",
-    control("N18", 0.05): "tri_normal_noise tri_roughness_ratio nav_drivable_width_mae lin_pocket_area_rel_err",
-    control("N12", 5.0): "topo_leak_frac",
-    control("N21", 30.0): "topo_free_b1_err topo_free_b2_err",
-    control("N07", 0.1): "occ2d_free_recall",
-    Fault("section", 0.1): "free3d_false_free",
-    control("N26", 2.0): "lin_pocket_depth_bias lin_pocket_depth_mae",
-    Fault("uneven sleepers"): "trk_sleeper_spacing_std_err",
-    Fault("track", 2.0, 12.0, 10.0): "trk_sleeper_in_bore trk_rail_lateral_rmse",
-    control("N24", 1.445): "trk_gauge_mean_err trk_gauge_p95_dev",
-    control("N08", 0.15): "trk_rail_height_rmse",
-    Fault("cut rails"): "trk_rail_gap_max",
-    Fault("lost fastenings"): "trk_fastener_ratio",
-    Fault("rails", 0.03, 12.0, 10.0): "trk_asset_penetration_max",
-    Fault("same names"): "mj_compiles",
-    Fault("stiff contacts"): "mj_step_finite",
-    control("N29", 1.0): "mj_probe_free_frac mj_wall_contact_err mjx_contact_parity mjx_traj_divergence",
-    Fault("moved lining"): "mj_ray_vs_mesh_mae mj_ray_leak_rate mj_frame_err",
-    Fault("lost sleeper"): "mj_manifest_match",
-    Fault("far scene"): "mj_xml_roundtrip",
-    Fault("ellipsoid"): "mjx_put_model",
-    control("N31", 0.3): "mjx_ray_parity env_lidar_vs_mesh",
-    control("N05", 2.0): "deg_weak_angle_diff",
-}  # fmt: skip
+ROWS = [row.split(" => ") for row in Path(__file__).with_name("moves.txt").read_text().splitlines() if row[0] != "#"]
+MOVES = {fault_of(fault): ids for fault, ids in ROWS}
 
 
 def test_every_scored_metric_has_a_fault_that_moves_it() -> None:
