@@ -7,6 +7,7 @@ with `--scene DIR` in the scene itself.
 
 import dataclasses
 import math
+import os
 import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
@@ -27,6 +28,7 @@ from subterra_jax.b2.gait import RELEASED
 from subterra_jax.evaluation import Episodes
 from subterra_jax.host.files import require_file
 from subterra_jax.host.task_ids import B2_TRAVERSE, full_id
+from subterra_jax.physics.stage import EngineName
 from subterra_jax.policies.opening import open_agent
 from subterra_jax.policies.trained import Trained
 from subterra_jax.tunnel.sources import load_tunnel
@@ -54,7 +56,8 @@ class Command:
     # Largest speed of a trained driver, m/s; its own if not given. A rover reaches 1.5, and slips less below.
     speed: float | None = None
     policy: str = RELEASED  # Gait: a file, the name of a released gait, or `trot`.
-    engine: Literal["mjx", "mujoco"] = "mjx"  # `mjx`, or `mujoco` in C on the host.
+    # `mjx`: by Warp where that is installed on a GPU, else by JAX; or one of the two; or `mujoco` in C on the host.
+    engine: EngineName = "mjx"
     tunnel: str | None = None  # Tunnels, files or names as `open:val:0-7`; the task's own if not given.
     scene: Path | None = None  # Built scene folder, instead of a tunnel.
     # Length of the tunnel to use, m; 0 is all of it. A policy trained on all of it has never been near a far mouth; for
@@ -108,6 +111,9 @@ def _open(arguments: Command) -> tuple[Any, Any]:
 
 
 def _drive(arguments: Command, job: int = 0) -> tuple[transfer.Walk, transfer.Row, Any]:
+    if arguments.jobs > 1 and hasattr(os, "sched_setaffinity"):  # each on a core, or all would compute on all of them
+        cores = sorted(os.sched_getaffinity(0))
+        os.sched_setaffinity(0, {cores[job % len(cores)]})
     env, params = _open(arguments)
     count, levels = params.tunnel.count, np.asarray(env.levels(params))
     index = np.array_split(np.arange(arguments.robots), arguments.jobs)[job]

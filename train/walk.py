@@ -1,7 +1,7 @@
 """Teaches the Unitree B2 to walk on a track: `python -m train.walk --out DIR`.
 
 What is learnt is added to a trot that walks by itself; `--seeds 0 1 2` trains one after the other, each into a folder
-of its own; `--release FILE` writes the last one for `subterra_jax.b2.gait.load_policy`.
+of its own; `--release FILE` writes the last one for `subterra_jax.load_policy`.
 """
 
 import argparse

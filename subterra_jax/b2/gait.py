@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from subterra_jax.b2 import constants as b2
 from subterra_jax.b2 import kinematics
-from subterra_jax.policies.files import GAIT, PolicyError, PolicyFile, read
+from subterra_jax.policies.files import GAIT, PolicyError, PolicyFile
 from subterra_jax.policies.network import act
 from subterra_jax.policies.trained import Tensors, nested
 
@@ -188,19 +188,6 @@ class WalkPolicy:
         self, obs: Float[Array, "*batch n_obs"], memory: tuple[()] = (), state: Any = None
     ) -> tuple[Float[Array, "*batch 12"], tuple[()]]:
         return self.act(obs), memory
-
-
-def load_policy(source: str | Path = RELEASED) -> tuple[WalkPolicy, dict[str, Any]]:
-    """Loads a gait and its facts.
-
-    Args:
-        source: A `.safetensors` file with its `.json` beside it, or the name of a released policy.
-
-    Raises:
-        PolicyError: The file is missing or damaged, or holds no gait.
-    """
-    file = read(source)
-    return make_policy(file), file.facts
 
 
 def make_policy(file: PolicyFile) -> WalkPolicy:

@@ -90,12 +90,8 @@ def leg_velocity(
     """Estimates the level velocity of the trunk, forward and to the left, m/s; exact if standing feet do not slip."""
     feet = kinematics.HIPS + kinematics.foot_positions(angles.reshape(4, 3))
     motion = kinematics.foot_velocities(angles.reshape(4, 3), speeds.reshape(4, 3))
-    spin_x = rates[1] * feet[:, 2] - rates[2] * feet[:, 1]
-    spin_y = rates[2] * feet[:, 0] - rates[0] * feet[:, 2]
-    spin_z = rates[0] * feet[:, 1] - rates[1] * feet[:, 0]
     fraction = standing / jnp.maximum(jnp.sum(standing), 1e-3)
-    x, y, z = (-jnp.sum(fraction * (motion[:, i] + spin)) for i, spin in enumerate((spin_x, spin_y, spin_z)))
-    return level_velocity(jnp.stack([x, y, z]), gravity)
+    return level_velocity(-jnp.sum(fraction[:, None] * (motion + jnp.cross(rates, feet)), axis=0), gravity)
 
 
 def level_velocity(velocity: Float[Array, "3"], gravity: Float[Array, "3"]) -> Float[Array, "2"]:
@@ -103,15 +99,7 @@ def level_velocity(velocity: Float[Array, "3"], gravity: Float[Array, "3"]) -> F
     size = jnp.sqrt(jnp.maximum(gravity[0] * gravity[0] + gravity[2] * gravity[2], 1e-6))
     # Forward, made perpendicular to gravity by turning about the trunk's y; then left, which is up × forward.
     forward = jnp.stack([-gravity[2], 0.0, gravity[0]]) / size
-    up = -gravity
-    left = jnp.stack(
-        [
-            up[1] * forward[2] - up[2] * forward[1],
-            up[2] * forward[0] - up[0] * forward[2],
-            up[0] * forward[1] - up[1] * forward[0],
-        ]
-    )
-    return jnp.stack([jnp.sum(velocity * forward), jnp.sum(velocity * left)])
+    return jnp.stack([jnp.sum(velocity * forward), jnp.sum(velocity * jnp.cross(-gravity, forward))])
 
 
 def field_sizes(privileged: bool) -> dict[str, int]:

@@ -3,18 +3,19 @@
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import jax.numpy as jnp
 
-from subterra_jax.b2.gait import RELEASED, WalkPolicy, check_fits, load_policy
+from subterra_jax.b2.gait import RELEASED, WalkPolicy, check_fits, make_policy
 from subterra_jax.b2.mission import PERIODS, Legs
 from subterra_jax.b2.model import B2
 from subterra_jax.b2.params import RandomisationParams, WalkParams
 from subterra_jax.b2.walk import WalkEnv
 from subterra_jax.parts.odometer import OdometryParams
 from subterra_jax.parts.unicycle import VehicleParams
-from subterra_jax.physics.stage import ENGINES, Stage, settle
+from subterra_jax.physics.stage import ENGINES, EngineName, Stage, settle
+from subterra_jax.policies.files import read
 from subterra_jax.rules import StartParams
 from subterra_jax.state import as_arrays
 from subterra_jax.tunnel import Tunnel
@@ -41,7 +42,7 @@ def make(
     lining: str | None = None,
     *,
     scene: str | Path | None = None,
-    engine: Literal["mjx", "mujoco"] = "mjx",
+    engine: EngineName = "mjx",
     driven: bool = False,
     privileged: bool = False,
     **overrides: Any,
@@ -53,8 +54,7 @@ def make(
             its sleepers as measured, or on its floor where it has none.
         lining: Variant of the walls; None is `pockets`, or the first where a tunnel has none.
         scene: A built scene folder, whose tunnel is taken; instead of `tunnel`.
-        engine: `mjx`, for thousands on a GPU; or `mujoco`, in C on the host, for a few: in `scene.xml` where there is a
-            scene.
+        engine: As for `physics.stage.settle`.
         driven: As for `WalkEnv`.
         privileged: As for `WalkEnv`.
         **overrides: Fields of `WalkParams` to replace.
@@ -126,6 +126,6 @@ def _gait(policy: WalkPolicy | str | Path, size: int) -> WalkPolicy | None:
     if policy == TROT:
         return None
     source = policy.name if isinstance(policy, WalkPolicy) else policy
-    trained = policy if isinstance(policy, WalkPolicy) else load_policy(policy)[0]
+    trained = policy if isinstance(policy, WalkPolicy) else make_policy(read(policy))
     check_fits(trained, size, source)
     return trained

@@ -35,14 +35,10 @@ class LaggedWheels(Unicycle):
     The defaults were identified from the released gait: 900 steps of six robots in MuJoCo, steered along the
     centreline with noisy commands. `State.command` is the motion of the robot, so that the reward's jerk is that of its
     motion.
-
-    Attributes:
-        lag: Time constants of forward speed and yaw rate, s.
-        gain: Final speed and yaw rate over a lasting command.
     """
 
-    lag: tuple[float, float] = (0.38, 0.24)
-    gain: tuple[float, float] = (1.01, 1.07)
+    lag: tuple[float, float] = (0.38, 0.24)  # time constants of forward speed and yaw rate, s
+    gain: tuple[float, float] = (1.01, 1.07)  # final speed and yaw rate over a lasting command
 
     def obey(self, action: Float[Array, "n_action"], state: State, params: EnvParams) -> Float[Array, "2"]:
         """Follow the clipped command, late."""
@@ -53,15 +49,10 @@ class LaggedWheels(Unicycle):
 
 @dataclasses.dataclass(frozen=True)
 class NoddingLidar(PlanarLidar):
-    """A planar LiDAR that leans with the trunk, at random in each step: beams that point down end on the ballast.
+    """A planar LiDAR that leans with the trunk, at random in each step: beams that point down end on the ballast."""
 
-    Attributes:
-        lean: Mean pitch, nose down, and standard deviations of pitch and roll, rad.
-        height: Height of the LiDAR over the ballast, m.
-    """
-
-    lean: tuple[float, float, float] = (0.03, 0.04, 0.03)
-    height: float = 0.75
+    lean: tuple[float, float, float] = (0.03, 0.04, 0.03)  # mean pitch, nose down, and σ of pitch and roll, rad
+    height: float = 0.75  # height of the LiDAR over the ballast, m
 
     def normals(self, params: EnvParams) -> int:
         """One for each beam, then pitch and roll."""

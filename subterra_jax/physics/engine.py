@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 from subterra_jax.physics.ground import N_PLANES, Window, touched_planes
 from subterra_jax.physics.rotations import upright
 
-with contextlib.redirect_stdout(io.StringIO()):  # it prints that Warp, which is not used here, is missing
+with contextlib.redirect_stdout(io.StringIO()):  # it prints that Warp is missing
     from mujoco import mjx
 
 TIMESTEP = 0.004  # of the physics, s
@@ -152,9 +152,8 @@ class Engine:
     def _ids(model: mujoco.MjModel, names: tuple[str, ...], prefix: str = "") -> np.ndarray:
         return np.array([model.geom(prefix + name).id for name in names])
 
-    def model_of(self, build: Build | None) -> mjx.Model:
-        """Return the model of one robot; of the robot as it is without a build."""
-        model = self.model
+    def model_of(self, build: Build | None, model: mjx.Model) -> mjx.Model:
+        """Return the model of one robot, from that of the robot as it is, which stays without a build."""
         if build is None:
             return model
         trunk, treads = self.host.body(self.machine.trunk).id, self._ids(self.host, self.machine.treads)
@@ -178,28 +177,25 @@ class Engine:
             window: Ground and walls.
             build: Properties of the robot; None for those of its model.
         """
-        model, treads = self.model_of(build), self._ids(self.host, self.machine.treads)
-        data = self.blank.replace(ctrl=control)
-        wall_turns = jax.vmap(upright)(window.away)
+        model, data = self.model_of(build, self.model), self.blank.replace(ctrl=control)
 
         def substep(now: Body, _: None) -> tuple[Body, None]:
             here = data.replace(qpos=now.qpos, qvel=now.qvel, qacc_warmstart=now.warmstart, act=now.act)
-            placed = mjx.kinematics(model, here)
-            centre, axle = placed.geom_xpos[treads], placed.geom_xmat[treads][:, :, 2]
-            points, normals = jax.vmap(self._planes, (None, 0, 0))(window, centre, axle)
-            turns = jax.vmap(upright)(normals.reshape(-1, 3))
-            after = mjx.step(
-                model,
-                here.replace(
-                    mocap_pos=jnp.concatenate([points.reshape(-1, 3), window.wall]),
-                    mocap_quat=jnp.concatenate([turns, wall_turns]),
-                ),
-            )
+            after = mjx.step(model, self.on_ground(here, window))
             return Body(after.qpos, after.qvel, after.qacc_warmstart, after.act), None
 
         # A GPU would round the products inside MJX to TF32, three digits.
         with jax.default_matmul_precision("highest"):
             return lax.scan(substep, body, None, length=self.substeps)[0]
+
+    def on_ground(self, data: mjx.Data, window: Window) -> mjx.Data:
+        """Return data whose planes are where the robot may touch ground and walls."""
+        treads = self._ids(self.host, self.machine.treads)
+        placed = mjx.kinematics(self.model, self.blank.replace(qpos=data.qpos))
+        centre, axle = placed.geom_xpos[treads], placed.geom_xmat[treads][:, :, 2]
+        points, normals = jax.vmap(self._planes, (None, 0, 0))(window, centre, axle)
+        turns = jax.vmap(upright)(jnp.concatenate([normals.reshape(-1, 3), window.away]))
+        return data.replace(mocap_pos=jnp.concatenate([points.reshape(-1, 3), window.wall]), mocap_quat=turns)
 
     def _planes(self, window: Window, centre: Float[Array, "3"], axle: Float[Array, "3"]) -> tuple[Array, Array]:
         tread = self.alone.geom(self.machine.treads[0])
@@ -248,23 +244,14 @@ class MujocoEngine(Engine):
 
 
 class Workbench:
-    """One model with its data, used for many robots in turn; a step does not depend on the robot before.
-
-    Args:
-        model: A world with the robot and nothing else that moves.
-
-    Attributes:
-        model: The model.
-        data: Its data.
-        watch: Called with the data at the end of each control period, as for a film; `None` by default.
-    """
+    """A world with one robot and nothing else that moves, used for many in turn; a step does not depend on the last."""
 
     def __init__(self, model: mujoco.MjModel, machine: Machine):
         self.model, self.data, self._usual = model, mujoco.MjData(model), copy.copy(model)
         self._lock = threading.Lock()  # held while a robot is advanced
         self._treads = Engine._ids(model, machine.treads, PREFIX)
         self._trunk = int(model.body(PREFIX + machine.trunk).id)
-        self.watch: Callable[[mujoco.MjData], None] | None = None
+        self.watch: Callable[[mujoco.MjData], None] | None = None  # called at the end of each control period
 
     def apply_build(self, build: Build) -> None:
         model, usual = self.model, self._usual

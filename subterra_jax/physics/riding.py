@@ -27,15 +27,10 @@ _TILT = 1.0  # of a trunk that has fallen, rad
 
 @struct.dataclass
 class Ride:
-    """A robot on the ground.
+    """A robot on the ground."""
 
-    Attributes:
-        body: State of the physics, positions from the anchor.
-        anchor: Row of the track nearest to it.
-    """
-
-    body: Body
-    anchor: Int[Array, ""]
+    body: Body  # state of the physics, positions from the anchor
+    anchor: Int[Array, ""]  # row of the track nearest to it
 
 
 def place_on(track: Track, plane: State, height: float) -> tuple[Float[Array, "7"], Int[Array, ""]]:

@@ -93,9 +93,8 @@ def on_rover(
         tunnel: As for `subterra_jax.make`.
         lining: As for `subterra_jax.make`.
         stretch: Start and length of the stretch of tunnel, m; None for the whole.
-        overrides: Entries in place of the defaults; and `engine`: `mjx`, for thousands on a GPU, or `mujoco`, in C on
-            the host, for a few; and `scene`, the folder of a built scene, whose `scene.xml` that engine takes and whose
-            triangles the LiDAR sees.
+        overrides: Entries in place of the defaults; and `engine`, as for `settle`; and `scene`, the folder of a built
+            scene, whose `scene.xml` MuJoCo's engine takes and whose triangles the LiDAR sees.
         hidden_start: The start among them is not the user's own.
 
     Raises:

@@ -6,7 +6,7 @@ That is a scene as it was built, or ground and walls of a plan.
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import mujoco
 import numpy as np
@@ -18,17 +18,20 @@ from subterra_jax.params import collect_entries
 from subterra_jax.physics.engine import Engine, Machine, MujocoEngine
 from subterra_jax.physics.ground import RAIL_HALF, RAIL_OFFSET, SLEEPER_HALF, Track, TrackError, join_tracks, read_track
 from subterra_jax.physics.riding import Physical
+from subterra_jax.physics.warp import INSTALLED, WarpEngine
+from subterra_jax.pictures.stage import add_box
 from subterra_jax.tunnel.plan import TunnelPlan
 from subterra_jax.tunnel_env import TunnelEnv
 
-ENGINES = ("mjx", "mujoco")
+EngineName = Literal["mjx", "mjx-jax", "mjx-warp", "mujoco"]
+ENGINES: tuple[EngineName, ...] = get_args(EngineName)
 _MARGIN = 0.1  # to either side of a robot, m
 _ON_TRACK, _FROM_MOUTH = 0.3, 1.0  # of starts where none is given: largest lateral offset, least station, m
 _SCOUT = "scout"  # the robot that a scene comes with
 _DEEP, _THICK = 0.05, 0.1  # half of a sleeper's or slab's box; of a wall, m
 _WALL = (0.5, 2.0)  # walls reach from so far below the ground to so far above it, m
 _OVERLAP, _PORCH = 0.01, 3.0  # of slabs, m: over the next one, and beyond the mouths
-_BED, _RAIL, _SLEEPER = (0.35, 0.33, 0.31, 1.0), (0.40, 0.33, 0.28, 1.0), (0.62, 0.61, 0.58, 1.0)
+_BED, _RAIL, _SLEEPER, _GLASS = (0.35, 0.33, 0.31), (0.40, 0.33, 0.28), (0.62, 0.61, 0.58), (0.7, 0.7, 0.7, 0.3)
 
 
 class RobotError(SubterraError):
@@ -37,19 +40,12 @@ class RobotError(SubterraError):
 
 @dataclasses.dataclass(frozen=True)
 class Stage:
-    """A robot's place.
+    """A robot's place."""
 
-    Attributes:
-        track: The ground of its tunnels.
-        engine: The engine with the robot.
-        relief: Surface of a scene, which the LiDAR sees; None without a scene.
-        room: Distance to either side of the axis at which no side of the robot is at a wall or a rail, m.
-    """
-
-    track: Track
-    engine: Engine
-    relief: Relief | None
-    room: float
+    track: Track  # ground of its tunnels
+    engine: Engine  # engine with the robot
+    relief: Relief | None  # surface of a scene, which the LiDAR sees; None without a scene
+    room: float  # distance to either side of the axis at which no side of the robot is at a wall or a rail, m
 
     def mount(
         self, env: TunnelEnv, motion: Physical, entries: Mapping[str, Any], given: bool
@@ -87,11 +83,11 @@ def settle(
 
     Args:
         scene: Folder of the built scene that is the one tunnel, if it is.
-        engine: `mjx`, for thousands on a GPU; or `mujoco`, in C on the host, for a few: in `scene.xml` where there is a
-            scene.
+        engine: `mjx`, for thousands on a GPU, by Warp where that is installed and else by JAX; `mjx-jax` or `mjx-warp`,
+            one of these; or `mujoco`, in C on the host, for a few: in `scene.xml` where there is a scene.
 
     Raises:
-        ValueError: There is no such engine, or that in C gets many tunnels.
+        ValueError: There is no such engine, Warp is not installed, or that in C gets many tunnels.
         RobotError: A tunnel is narrower than the robot with 0.1 m to either side.
         TrackError: A tunnel is too short; or there is no such scene, or it has no floor.
     """
@@ -105,13 +101,20 @@ def settle(
                 f"tunnel {plan.name!r} is {free:.2f} m wide at {plan.station[narrowest]:.1f} m; "
                 f"the {machine.name} needs {needed:.2f} m"
             )
-    tracks, made = [read_track(plan) for plan in plans], Engine(machine)
+    tracks = [read_track(plan) for plan in plans]
+    # A scene is read at once and by all engines, so that what is wrong with it is said before the first step.
+    spec = None if scene is None else scene_world(scene_file(scene, lining))
     if engine == "mujoco":
         if len(plans) > 1:
             raise ValueError(f"engine='mujoco' drives in one tunnel, got {len(plans)}")
-        # A scene is read at once, so that what is wrong with it is said before the first step.
-        spec = None if scene is None else scene_world(scene_file(scene, lining))
-        made = MujocoEngine(machine, world=spec.copy if spec else lambda: tunnel_world(plans[0], tracks[0], lining))
+        made: Engine = MujocoEngine(
+            machine, world=spec.copy if spec else lambda: tunnel_world(plans[0], tracks[0], lining)
+        )
+    else:
+        if engine == "mjx-warp" and not INSTALLED:
+            raise ValueError("engine='mjx-warp' needs Warp: pip install 'subterra-jax[warp]'")
+        by_warp = INSTALLED and engine != "mjx-jax"
+        made = WarpEngine(machine, on_cpu=engine == "mjx-warp") if by_warp else Engine(machine)
     room = min(float(plan.half_width.min()) for plan in plans)
     if any(float(track.rails[0]) > 0.0 for track in tracks):
         room = min(room, RAIL_OFFSET - RAIL_HALF[0])
@@ -167,7 +170,7 @@ def tunnel_world(plan: TunnelPlan, track: Track, lining: str | None = None) -> m
         half_turn = 0.5 * np.arctan2(chord[k, 1], chord[k, 0])
         half = (0.5 * size[k], 0.5 * _THICK, 0.5 * sum(_WALL))
         turn = np.array([np.cos(half_turn), 0.0, 0.0, np.sin(half_turn)])
-        _add_box(spec, half, np.array(centre), turn, LOW_WALL, (0.7, 0.7, 0.7, 0.3))
+        add_box(spec, half, centre, turn, _GLASS, LOW_WALL)
     return spec
 
 
@@ -180,16 +183,16 @@ def add_ground(spec: mujoco.MjSpec, track: Track, half_width: float, start: floa
     for k in chosen:
         if protrusion > 0.0:
             sunk = _beside(position[k], turns[k], 0.0, -_DEEP)
-            _add_box(spec, (*SLEEPER_HALF, _DEEP), sunk, turns[k], ROLL | GROUND, _SLEEPER)
+            add_box(spec, (*SLEEPER_HALF, _DEEP), sunk, turns[k], _SLEEPER, ROLL | GROUND)
         if k + 1 >= len(station):
             continue
         middle, turn = 0.5 * (position[k] + position[k + 1]), _mean(turns[k], turns[k + 1])
         beyond = _PORCH if k in (0, len(station) - 2) else _OVERLAP
         half = 0.5 * float(np.linalg.norm(position[k + 1] - position[k])) + beyond
         bed = _beside(middle, turn, 0.0, -protrusion - _DEEP)
-        _add_box(spec, (half, half_width, _DEEP), bed, turn, ROLL | GROUND, _BED)
+        add_box(spec, (half, half_width, _DEEP), bed, turn, _BED, ROLL | GROUND)
         for side in (RAIL_OFFSET, -RAIL_OFFSET) if rails else ():
-            _add_box(spec, (half, *RAIL_HALF), _beside(middle, turn, side, RAIL_HALF[1]), turn, GROUND | RAIL, _RAIL)
+            add_box(spec, (half, *RAIL_HALF), _beside(middle, turn, side, RAIL_HALF[1]), turn, _RAIL, GROUND | RAIL)
 
 
 def _mean(first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -202,17 +205,3 @@ def _beside(point: np.ndarray, turn: np.ndarray, left: float, up: float) -> np.n
     turned = np.zeros(3)
     mujoco.mju_rotVecQuat(turned, np.array([0.0, left, up]), turn)
     return point + turned
-
-
-def _add_box(
-    spec: mujoco.MjSpec,
-    half: tuple[float, ...],
-    middle: np.ndarray,
-    turn: np.ndarray,
-    bits: int,
-    colour: tuple[float, ...],
-) -> None:
-    spec.worldbody.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_BOX, size=half, pos=middle, quat=turn, contype=bits, conaffinity=0, group=1,
-        rgba=colour,
-    )  # fmt: skip

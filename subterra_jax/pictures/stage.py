@@ -109,12 +109,14 @@ def add_surface(
     )  # fmt: skip
 
 
-def add_box(spec: mujoco.MjSpec, half: Any, position: Any, quaternion: Any, colour: tuple[float, float, float]) -> None:
-    """Adds a box to the world that collides with nothing; half sizes and position in m."""
+def add_box(
+    spec: mujoco.MjSpec, half: Any, position: Any, quaternion: Any, colour: tuple[float, ...], bits: int = 0
+) -> None:
+    """Adds a box to the world that collides with nothing but robots with these bits; half sizes and position in m."""
     import mujoco
 
     spec.worldbody.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_BOX, size=half, pos=position, quat=quaternion, rgba=(*colour, 1.0), contype=0,
+        type=mujoco.mjtGeom.mjGEOM_BOX, size=half, pos=position, quat=quaternion, rgba=(*colour, 1.0)[:4], contype=bits,
         conaffinity=0, group=1,
     )  # fmt: skip
 

@@ -20,7 +20,8 @@ from benchmarks.records import read_records
 from subterra_jax.b2 import gait as gaits
 from subterra_jax.b2.transfer import LaggedWheels
 from subterra_jax.host.errors import OutputError
-from subterra_jax.policies.files import PolicyError
+from subterra_jax.policies import PolicyError, load
+from subterra_jax.policies.files import read
 from tests.train.conftest import SMALL, TASK, call
 from train import __main__ as navigate
 from train import checkpoint, curve, walk
@@ -167,7 +168,7 @@ def test_the_policy_does_not_see_the_truth_and_the_critic_does(driver, policy):
 def test_a_released_gait_acts_as_the_one_that_was_trained(driver, policy, tmp_path):
     out = tmp_path / "gait.safetensors"
     write_tensors(out, driver.kind, driver.layout, driver.tensors(policy), {"task": "Subterra/B2Walk-v1", "world": {}})
-    loaded, facts = gaits.load_policy(out)
+    loaded, facts = load(out)
     seen = jax.random.normal(jax.random.key(3), (5, N_SEEN + N_TRUTH))
     expected = driver.action(answer(driver, policy, seen).mean)
     np.testing.assert_allclose(loaded.act(seen[:, :N_SEEN]), expected, atol=1e-6)
@@ -183,18 +184,9 @@ def test_statistics_of_the_observation_are_those_of_what_was_seen(driver, policy
     np.testing.assert_allclose(driver.raw(driver.inputs(policy, seen), policy), seen, atol=1e-5)
 
 
-def test_a_missing_gait_is_refused_by_name(tmp_path):
-    with pytest.raises(PolicyError, match="no such policy"):
-        gaits.load_policy(tmp_path / "none.safetensors")
-
-
-def test_a_policy_that_is_no_gait_is_refused(driver, policy, tmp_path):
-    out = tmp_path / "gait.safetensors"
-    write_tensors(out, driver.kind, driver.layout, driver.tensors(policy), {"task": "Subterra/B2Walk-v1", "world": {}})
-    facts = out.with_suffix(".json")
-    facts.write_text(json.dumps({**json.loads(facts.read_text()), "kind": "ppo"}))
-    with pytest.raises(PolicyError, match="kind 'ppo', which is no gait"):
-        gaits.load_policy(out)
+def test_a_policy_that_is_no_gait_is_refused():
+    with pytest.raises(PolicyError, match="a policy of kind 'ppo', which is no gait"):
+        gaits.make_policy(read("Traverse-v1"))
 
 
 def test_a_constant_lag_is_scored_as_what_it_is():

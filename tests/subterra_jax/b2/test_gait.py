@@ -12,10 +12,10 @@ import pytest
 import subterra_jax as st
 from subterra_jax.b2 import constants as b2
 from subterra_jax.b2 import gait, kinematics
-from subterra_jax.b2.gait import load_policy
 from subterra_jax.b2.model import robot_spec
 from subterra_jax.b2.tasks import make
 from subterra_jax.b2.walk import command_joints
+from subterra_jax.policies import load
 from tests.subterra_jax.b2.conftest import N_ROBOTS
 
 PERIOD, DOWN = 0.02, jnp.array([0.0, 0.0, -1.0])
@@ -196,7 +196,7 @@ def test_in_ten_seconds_robots_of_both_engines_get_equally_far(walking, moment):
     steered = dataclasses.replace(walking.params.command, low=low, high=high, still=jnp.float32(0.0))
     params = dataclasses.replace(params, command=steered)
     env, _ = make(engine="mujoco")
-    in_c, act, far = jax.jit(st.AutoReset(env).step), jax.jit(load_policy()[0].act), []
+    in_c, act, far = jax.jit(st.AutoReset(env).step), jax.jit(load(gait.RELEASED)[0].act), []
     for step in (walking.compiled["step"], in_c):
         state, action, ended = fresh, jnp.zeros((N_ROBOTS, 12)), False
         for k in range(500):

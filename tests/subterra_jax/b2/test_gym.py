@@ -21,7 +21,6 @@ from subterra_jax.physics.ground import TrackError
 from subterra_jax.physics.rotations import yaw
 from subterra_jax.physics.stage import RobotError
 from subterra_jax.policies import PolicyError
-from subterra_jax.rules import StartParams
 from tests.subterra_jax.placing import draw
 
 ID = "Subterra/B2Traverse-v1"
@@ -177,8 +176,6 @@ def test_the_zero_action_walks_as_it_is_told_in_mujoco_too(walk):
 def test_who_asks_for_what_is_not_there_is_told_in_a_sentence(plan, tmp_path):
     with pytest.raises(PolicyError, match="no-such-gait: no such policy"):
         st.make(ID, plan, policy="no-such-gait")
-    with pytest.raises(ValueError, match="no engine 'bullet'"):
-        st.make(ID, plan, policy="trot", engine="bullet")
     with pytest.raises(ValueError, match=r"every 0\.2 s"):
         st.make(ID, plan, policy="trot", vehicle=tasks.VEHICLE.replace(period=0.1))
     with pytest.raises(ValueError, match="no field"):
@@ -192,12 +189,11 @@ def test_who_asks_for_what_is_not_there_is_told_in_a_sentence(plan, tmp_path):
         st.make(ID, **in_scene, policy="trot")
     (tmp_path / "scene.xml").write_text('<mujoco><worldbody><geom size="1" contype="8"/></worldbody></mujoco>')
     for asked in ((ID, {}), ("Subterra/Traverse-v1", {"motion": "rover"})):
-        with pytest.raises(TrackError, match="the scene has no floor"):
-            st.make(asked[0], **in_scene, **asked[1])
+        for engine in ("mujoco", "mjx"):
+            with pytest.raises(TrackError, match="the scene has no floor"):
+                st.make(asked[0], **{**in_scene, "engine": engine}, **asked[1])
         with pytest.raises(ValueError, match="either a tunnel or a scene, got both 'metro'"):
             st.make(asked[0], "metro", **in_scene, **asked[1])
-    with pytest.raises(ValueError, match=r"start\.lateral = 3 m may put the B2 into a wall"):
-        st.make(ID, plan, policy="trot", start=StartParams(lateral=3.0))
 
 
 DRAW = """

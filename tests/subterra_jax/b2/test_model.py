@@ -95,7 +95,7 @@ def test_only_feet_touch_the_ground_and_only_the_bumpers_walls(model):
 def test_the_friction_that_is_drawn_is_that_of_the_feet_and_of_nothing_else():
     engine = Engine(B2)
     build = Build(jnp.asarray(0.33), jnp.ones(()), jnp.zeros(3), jnp.ones(12), jnp.ones(12))
-    host, friction = engine.host, np.asarray(engine.model_of(build).pair_friction[:, 0])
+    host, friction = engine.host, np.asarray(engine.model_of(build, engine.model).pair_friction[:, 0])
     touching = [{host.geom(g).name for g in pair} for pair in zip(host.pair_geom1, host.pair_geom2, strict=True)]
     feet = np.array([bool(names & set(engine.machine.treads)) for names in touching])
     assert feet.sum() == N_PLANES * 4

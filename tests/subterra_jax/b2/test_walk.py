@@ -10,11 +10,8 @@ import pytest
 import subterra_jax as st
 from subterra_jax.b2 import constants as b2
 from subterra_jax.b2.observation import locate
-from subterra_jax.b2.tasks import make
 from subterra_jax.physics.rotations import rotate
-from subterra_jax.physics.stage import RobotError
 from tests.subterra_jax.b2.conftest import N_ROBOTS
-from tests.subterra_jax.tunnels import straight, tunnel_arrays
 
 
 def run(walking, seconds, params, seed=0):
@@ -182,12 +179,6 @@ def test_a_wall_stops_a_robot_that_is_told_to_walk_through_it(walking):
     assert touched
     assert np.max(reached[0]) < 2.4
     assert 2.45 < np.max(reached) < 2.825 - 0.1
-
-
-def test_a_tunnel_narrower_than_the_robot_is_refused_with_its_width(plan_of):
-    narrow = plan_of(tunnel_arrays(straight(20.0), half_width=0.28))
-    with pytest.raises(RobotError, match=r"is 0\.56 m wide at 0\.0 m; the B2 needs 0\.65 m"):
-        make(tunnel=narrow)
 
 
 def test_a_misspelt_field_is_refused_by_name():

@@ -12,11 +12,12 @@ import pytest
 import subterra_jax as st
 from subterra_jax.episode import Driver
 from subterra_jax.host import rover
-from subterra_jax.physics.engine import Body, MujocoEngine
+from subterra_jax.physics.engine import Body, Engine, MujocoEngine, mjx
 from subterra_jax.physics.ground import RAIL_HALF, RAIL_OFFSET, join_tracks, read_track
 from subterra_jax.physics.riding import Ride, advance_period
-from subterra_jax.physics.rolling import ROVER, Rover
-from subterra_jax.physics.stage import ENGINES, RobotError, tunnel_world
+from subterra_jax.physics.rolling import ROVER
+from subterra_jax.physics.stage import RobotError, tunnel_world
+from subterra_jax.physics.warp import INSTALLED, WarpEngine
 from subterra_jax.policies.opening import open_agent
 from subterra_jax.rules import StartParams
 from subterra_jax.tunnel import Tunnel
@@ -26,6 +27,8 @@ from tests.subterra_jax.tunnels import straight, tunnel_arrays
 ID = "Subterra/TraverseShort-v1"
 HALF_WIDTH = 2.0
 PERIOD = 0.02  # s
+IN_MJX = {"mjx-jax": Engine(ROVER)} | ({"mjx-warp": WarpEngine(ROVER, on_cpu=True)} if INSTALLED else {})
+ENGINES = ("mujoco", *IN_MJX)
 
 
 @pytest.fixture(scope="module")
@@ -42,18 +45,17 @@ def drives(plans):
     both = join_tracks(tracks)
     worlds = [lambda p=plan, t=track: tunnel_world(p, t, "smooth") for plan, track in zip(plans, tracks, strict=True)]
     engines = [MujocoEngine(ROVER, world=world) for world in worlds]
-    in_mjx = Rover().engine
     quick = {"xla_backend_optimization_level": 0}
-    compiled = []
+    compiled = {}
 
     def advance(name, laid, ride, control):
         if name == "mujoco":
             origin, engine = np.asarray(both.position)[ride.anchor], engines[laid]
             return Ride(engine.bench.run(ride.body, control, origin, None, engine.substeps), ride.anchor)
-        if not compiled:
-            one = lambda ride, control: advance_period(in_mjx, ride, control, None, both, tunnel)[0]  # noqa: E731
-            compiled.append(jax.jit(one).lower(ride, control).compile(quick))
-        return compiled[0](ride, control)
+        if name not in compiled:
+            one = lambda ride, control: advance_period(IN_MJX[name], ride, control, None, both, tunnel)[0]  # noqa: E731
+            compiled[name] = jax.jit(one).lower(ride, control).compile(quick)
+        return compiled[name](ride, control)
 
     def run(name, laid, seconds, control, place=(10.0, 0.0, 0.0), yaw=0.0, velocity=(0.0, 0.0, 0.0)):
         anchor = both.nearest(jnp.float32(place[0]), laid)
@@ -127,13 +129,48 @@ def test_energy_does_not_come_from_nothing(drive):
     assert where[-1, 2] == pytest.approx(0.0, abs=0.01)
 
 
-def test_from_one_state_both_engines_drive_alike_for_ten_seconds(drives):
+def test_from_one_state_all_engines_drive_alike_for_ten_seconds(drives):
     """Away from walls and rails, which turn a robot to one side or the other by a hair's breadth."""
     for laid, most, aside in ((0, 0.25, 0.0), (1, 0.05, 0.1)):
         winding = lambda t, most=most: (0.6, most * np.cos(0.6 * t))  # noqa: E731
-        in_mjx, in_c = (drive(laid, 10.0, winding, (10.0, aside, 0.0))[0] for drive in drives.values())
-        assert np.linalg.norm(in_mjx - in_c, axis=1).max() < 0.03
-        assert np.ptp(in_mjx[:, 0]) > 5.0
+        in_c, *in_mjx = (drive(laid, 10.0, winding, (10.0, aside, 0.0))[0] for drive in drives.values())
+        assert np.linalg.norm(np.array(in_mjx) - in_c, axis=2).max() < 0.03
+        assert np.ptp(in_c[:, 0]) > 5.0
+
+
+@pytest.mark.skipif(not INSTALLED, reason="needs Warp")
+@pytest.mark.parametrize(("contacts", "rows"), [(24, 36), (1, 36), (24, 3)])
+def test_warp_tells_that_its_buffers_are_too_small(task, contacts, rows, monkeypatch):
+    _, params, go = task
+    rides = jax.tree.map(lambda leaf: jnp.stack([leaf] * 2), go([(1.0, 0.0)] * 3)[1][-1][0].parts["rover"])
+    whole = WarpEngine._in_warp
+
+    def small(engine, n):
+        with jax.ensure_compile_time_eval():
+            data = mjx.make_data(engine.host, impl="warp", naconmax=contacts, naccdmax=0, njmax=rows)
+        return whole(engine, n)[0], data
+
+    monkeypatch.setattr(WarpEngine, "_in_warp", small)
+    one = functools.partial(advance_period, WarpEngine(ROVER, on_cpu=True))
+    shared = jnp.zeros(2), None, params.track, params.tunnel
+    after, *_, wrong = jax.vmap(one, (0, *[None] * 4))(rides, *shared)
+    assert bool(wrong.all()) == bool(wrong.any()) == ((contacts, rows) != (24, 36))
+    assert np.isfinite(after.body.qpos).all()
+
+
+def test_warp_sees_nested_batches_as_one_and_jax_serves_where_it_cannot(monkeypatch):
+    """With a stand-in for the steps of both, since Warp may not be installed."""
+    step, sizes = lambda engine, body, control, window, build=None: body.replace(qvel=control[0] * body.qvel), []
+    monkeypatch.setattr(Engine, "run", step)
+    monkeypatch.setattr(WarpEngine, "_in_warp", lambda engine, n: (sizes.append(n), None))
+    monkeypatch.setattr(WarpEngine, "_advance", lambda engine, model, data, *given: step(engine, *given))
+    body, speeds = Body(jnp.ones(11), jnp.arange(10.0), jnp.zeros(10)), jnp.arange(6.0).reshape(2, 3)
+    run = lambda v, on_cpu=True: WarpEngine(ROVER, on_cpu=on_cpu).run(body, jnp.stack([v, v]), None).qvel  # noqa: E731
+    assert run(2.0, on_cpu=False)[3] == 6.0
+    assert not sizes
+    np.testing.assert_array_equal(jax.jit(jax.vmap(jax.vmap(run)))(speeds), speeds[..., None] * body.qvel)
+    assert sizes[-1] == 6
+    assert jax.grad(lambda v: run(v)[3])(2.0) == 3.0
 
 
 @pytest.fixture(scope="module")
@@ -208,7 +245,7 @@ def test_what_it_cannot_do_is_refused_in_a_sentence(plans, plan_of):
         ask(tunnel=floor, start=StartParams(lateral=1.8))
     with pytest.raises(ValueError, match="a ready Tunnel holds no heights"):
         ask(tunnel=Tunnel.from_plan(floor))
-    with pytest.raises(ValueError, match="no engine 'bullet'; there are mjx, mujoco"):
+    with pytest.raises(ValueError, match="no engine 'bullet'; there are mjx, mjx-jax, mjx-warp, mujoco"):
         ask(tunnel=floor, engine="bullet")
     with pytest.raises(ValueError, match="drives in one tunnel, got 2"):
         ask(tunnel=[floor, floor], engine="mujoco")
