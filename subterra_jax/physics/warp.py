@@ -34,7 +34,9 @@ class WarpEngine(Engine):
 
     def run(self, body: Body, control: Float[Array, "n_servos"], window: Window, build: Build | None = None) -> Body:
         """Advance the robot by one control period; see `Engine.run`. Derivatives are those of JAX."""
-        if not (self.on_cpu or (jax.config.jax_default_device or jax.devices()[0]).platform == "gpu"):
+        with jax.ensure_compile_time_eval():
+            device = next(iter(jnp.zeros(()).devices()))  # that the program is made for
+        if not self.on_cpu and device.platform != "gpu":
             return super().run(body, control, window, build)
         rows = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], (body, control, window, build))
         return jax.tree.map(lambda leaf: leaf[0], self._differentiable(*rows))
