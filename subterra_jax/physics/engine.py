@@ -63,27 +63,16 @@ class Build:
 
 @dataclasses.dataclass(frozen=True)
 class Machine:
-    """A robot for the engine. Its spec holds it alone, on a free joint.
+    """A robot for the engine. Its spec holds it alone, on a free joint."""
 
-    Attributes:
-        name: What it is called in sentences.
-        width: Its width, m.
-        spec: Makes its MJCF.
-        trunk: The body on the free joint.
-        treads: Balls that touch the ground.
-        bumpers: Balls on the trunk that touch walls.
-        half_width: Half the width of wheels in those balls, on whose z axes they turn, m; None without wheels.
-        dress: Adds looks for pictures; None where the spec has them.
-    """
-
-    name: str
-    width: float
-    spec: Callable[[], mujoco.MjSpec]
-    trunk: str
-    treads: tuple[str, ...]
-    bumpers: tuple[str, ...]
-    half_width: float | None = None
-    dress: Callable[[mujoco.MjSpec], None] | None = None
+    name: str  # what it is called in sentences
+    width: float  # its width, m
+    spec: Callable[[], mujoco.MjSpec]  # makes its MJCF
+    trunk: str  # the body on the free joint
+    treads: tuple[str, ...]  # balls that touch the ground
+    bumpers: tuple[str, ...]  # balls on the trunk that touch walls
+    half_width: float | None = None  # half the width of wheels in the treads, on whose z axes they turn, m; None: balls
+    dress: Callable[[mujoco.MjSpec], None] | None = None  # adds looks for pictures; None where the spec has them
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -204,13 +193,9 @@ class Engine:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class MujocoEngine(Engine):
-    """MuJoCo in C on the host, in a world with a ground of its own; it advances the robots of a batch in turn.
+    """MuJoCo in C on the host, in a world with a ground of its own; it advances the robots of a batch in turn."""
 
-    Attributes:
-        world: Makes the MJCF of the world in the tunnel frame.
-    """
-
-    world: Callable[[], mujoco.MjSpec] = mujoco.MjSpec
+    world: Callable[[], mujoco.MjSpec] = mujoco.MjSpec  # makes the MJCF of the world in the tunnel frame
 
     def placed(self) -> mujoco.MjSpec:
         """Return the world with the robot in it."""

@@ -39,17 +39,7 @@ class WarpEngine(Engine):
         if not self.on_cpu and device.platform != "gpu":
             return super().run(body, control, window, build)
         rows = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], (body, control, window, build))
-        return jax.tree.map(lambda leaf: leaf[0], self._differentiable(*rows))
-
-    @functools.cached_property
-    def _differentiable(self) -> Any:
-        run = jax.custom_jvp(self._run_batch)
-
-        @run.defjvp
-        def by_jax(primals: Any, tangents: Any) -> Any:
-            return jax.jvp(jax.vmap(super(WarpEngine, self).run), primals, tangents)
-
-        return run
+        return jax.tree.map(lambda leaf: leaf[0], self._run_batch(*rows))
 
     @functools.cached_property
     def _run_batch(self) -> Any:
@@ -69,7 +59,9 @@ class WarpEngine(Engine):
             split = jax.tree.map(lambda leaf: leaf.reshape(size, len(leaf) // size, *leaf.shape[1:]), after)
             return split, jax.tree.map(lambda leaf: True, split)
 
-        return run
+        whole, by_jax = jax.custom_jvp(run), jax.vmap(super().run)
+        whole.defjvp(lambda before, change: jax.jvp(by_jax, before, change))
+        return whole
 
     def _advance(self, model: Any, data: Any, body: Body, control: Any, window: Window, build: Build | None) -> Body:
         model = self.model_of(build, model)
