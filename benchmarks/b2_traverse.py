@@ -56,8 +56,7 @@ class Command:
     # Largest speed of a trained driver, m/s; its own if not given. A rover reaches 1.5, and slips less below.
     speed: float | None = None
     policy: str = RELEASED  # Gait: a file, the name of a released gait, or `trot`.
-    # `mjx`: by Warp where that is installed on a GPU, else by JAX; or one of the two; or `mujoco` in C on the host.
-    engine: EngineName = "mjx"
+    engine: EngineName = "mjx"  # `mjx`, by Warp where it is installed on a GPU, or one way of it; or `mujoco`, in C.
     tunnel: str | None = None  # Tunnels, files or names as `open:val:0-7`; the task's own if not given.
     scene: Path | None = None  # Built scene folder, instead of a tunnel.
     # Length of the tunnel to use, m; 0 is all of it. A policy trained on all of it has never been near a far mouth; for
@@ -93,8 +92,7 @@ def _check(arguments: Command) -> None:
 def _open(arguments: Command) -> tuple[Any, Any]:
     tunnel: Any = None if arguments.tunnel is None else names_of(arguments.tunnel)
     if arguments.length:
-        plans = [load_tunnel(name) for name in tunnel or [None]]
-        tunnel = [plan.slice(0.0, min(arguments.length, plan.length)) for plan in plans]
+        tunnel = [load_tunnel(name).stretch((0.0, arguments.length)) for name in tunnel or [None]]
     if tunnel is not None and len(tunnel) == 1:
         tunnel = tunnel[0]
     options: dict[str, Any] = {"tunnel": tunnel}
@@ -178,7 +176,6 @@ def records_of(arguments: Command, figures: dict[str, float]) -> list[Record]:
     given = [(field.name, getattr(arguments, field.name), field.default) for field in dataclasses.fields(arguments)]
     changed = [(key, value) for key, value, usual in given if value != usual and key not in ("out", "jobs")]
     words = " ".join(f"--{key} {value}" for key, value in changed)
-    further = {"n": n, "split": str(place or "the task's own tunnels")}
     records = []
     for figure, value in figures.items():
         stem, _, unit = figure.rpartition("_")
@@ -192,7 +189,7 @@ def records_of(arguments: Command, figures: dict[str, float]) -> list[Record]:
                 f"{name}/{(stem if unit in ('percent', 'deg') else figure).replace('_', '-')}",
                 round(value, 1) if unit in ("percent", "deg") else float(f"{value:.3g}"),
                 _UNITS.get(unit, ""), f"benchmarks.b2_traverse {words}",
-                interval=interval, tolerance=tolerance, **further,
+                interval=interval, tolerance=tolerance, n=n, split=str(place or "the task's own tunnels"),
             )
         )  # fmt: skip
     return records

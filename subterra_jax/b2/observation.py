@@ -12,11 +12,11 @@ from subterra_jax.physics.ground import SPACING, Track
 from subterra_jax.physics.rotations import inverse, rotate
 
 _FOLLOW = 0.35  # fraction of a new reading in the smoothed speed
-_FIELDS = {
+FIELDS = {
     "rates": 3, "gravity": 3, "velocity": 2, "asked": 3, "commanded": 3, "trim": 3, "clock": 3, "angles": 12,
     "speeds": 12, "action": 12,
 }  # fmt: skip
-_PRIVILEGED = {"true_velocity": 3, "fall_speed": 1, "place": 4, "friction": 1, "mass": 1, "phase_of_track": 2}
+PRIVILEGED = {"true_velocity": 3, "fall_speed": 1, "place": 4, "friction": 1, "mass": 1, "phase_of_track": 2}
 
 
 @struct.dataclass
@@ -100,11 +100,6 @@ def level_velocity(velocity: Float[Array, "3"], gravity: Float[Array, "3"]) -> F
     # Forward, made perpendicular to gravity by turning about the trunk's y; then left, which is up × forward.
     forward = jnp.stack([-gravity[2], 0.0, gravity[0]]) / size
     return jnp.stack([jnp.sum(velocity * forward), jnp.sum(velocity * jnp.cross(-gravity, forward))])
-
-
-def field_sizes(privileged: bool) -> dict[str, int]:
-    """Return the size of each named part of an observation, in order."""
-    return {**_FIELDS, **(_PRIVILEGED if privileged else {})}
 
 
 def observe_self(state: WalkState) -> Float[Array, "56"]:

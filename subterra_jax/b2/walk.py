@@ -48,11 +48,11 @@ class WalkEnv:
 
     def observation_size(self, params: WalkParams) -> int:
         """Return the size of one observation."""
-        return sum(observation.field_sizes(self.privileged).values())
+        return max(part.stop for part in self.fields(params).values())
 
     def fields(self, params: WalkParams) -> dict[str, slice]:
         """Return the slice of each named part of an observation."""
-        sizes = observation.field_sizes(self.privileged)
+        sizes = {**observation.FIELDS, **(observation.PRIVILEGED if self.privileged else {})}
         ends = np.cumsum(list(sizes.values())).tolist()
         return {name: slice(end - size, end) for (name, size), end in zip(sizes.items(), ends, strict=True)}
 

@@ -111,8 +111,4 @@ def on_rover(
 def _plan(source: Source, stretch: tuple[float, float] | None) -> TunnelPlan:
     if isinstance(source, Tunnel):
         raise ValueError("motion='rover' needs the tunnel's name, file or plan: a ready Tunnel holds no heights")
-    plan = source if isinstance(source, TunnelPlan) else load_tunnel(source)
-    if stretch is None:
-        return plan
-    start, length = stretch
-    return plan.slice(start, min(length, plan.length - start))
+    return (source if isinstance(source, TunnelPlan) else load_tunnel(source)).stretch(stretch)

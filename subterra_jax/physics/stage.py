@@ -186,18 +186,14 @@ def add_ground(spec: mujoco.MjSpec, track: Track, half_width: float, start: floa
             add_box(spec, (*SLEEPER_HALF, _DEEP), sunk, turns[k], _SLEEPER, ROLL | GROUND)
         if k + 1 >= len(station):
             continue
-        middle, turn = 0.5 * (position[k] + position[k + 1]), _mean(turns[k], turns[k + 1])
+        middle, turn = 0.5 * (position[k] + position[k + 1]), turns[k] + turns[k + 1] * np.sign(turns[k] @ turns[k + 1])
+        turn /= np.linalg.norm(turn)
         beyond = _PORCH if k in (0, len(station) - 2) else _OVERLAP
         half = 0.5 * float(np.linalg.norm(position[k + 1] - position[k])) + beyond
         bed = _beside(middle, turn, 0.0, -protrusion - _DEEP)
         add_box(spec, (half, half_width, _DEEP), bed, turn, _BED, ROLL | GROUND)
         for side in (RAIL_OFFSET, -RAIL_OFFSET) if rails else ():
             add_box(spec, (half, *RAIL_HALF), _beside(middle, turn, side, RAIL_HALF[1]), turn, _RAIL, GROUND | RAIL)
-
-
-def _mean(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    total = first + second * np.sign(first @ second)
-    return total / np.linalg.norm(total)
 
 
 def _beside(point: np.ndarray, turn: np.ndarray, left: float, up: float) -> np.ndarray:

@@ -25,12 +25,9 @@ class WarpEngine(Engine):
     All robots of a batch share Warp's buffers, which hold every contact that they can have. Should Warp still tell that
     one was too small, the robots come back as NaN, which ends their episodes as any other fault of physics does. Warp
     adds up in no fixed order: the last bits differ from run to run.
-
-    Attributes:
-        on_cpu: Warp serves on a CPU too, slowly.
     """
 
-    on_cpu: bool = False
+    on_cpu: bool = False  # Warp serves on a CPU too, slowly
 
     def run(self, body: Body, control: Float[Array, "n_servos"], window: Window, build: Build | None = None) -> Body:
         """Advance the robot by one control period; see `Engine.run`. Derivatives are those of JAX."""

@@ -43,10 +43,7 @@ class TunnelChoice:
         if isinstance(source, Tunnel):
             raise ValueError("view='mujoco' needs the tunnel's name, file or plan: a ready Tunnel holds no heights")
         plan = source if isinstance(source, TunnelPlan) else load_tunnel(source, solid=True)
-        if self.stretch is None:
-            return plan
-        start, length = self.stretch
-        return plan.slice(start, min(length, plan.length - start))
+        return plan.stretch(self.stretch)
 
 
 class FollowCamera:

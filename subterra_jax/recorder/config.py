@@ -171,9 +171,7 @@ def open_place(
         physics["motion"] = motion
     given = plan if physics.get("scene") is None else None
     env, params = st.make(task, given, lining, sensor=sensor, **physics)
-    if cut := TASKS[task].stretch if task in TASKS else None:
-        plan = plan.slice(cut[0], min(cut[1], plan.length - cut[0]))
-    return World(env, params, plan)
+    return World(env, params, plan.stretch(TASKS[task].stretch if task in TASKS else None))
 
 
 def open_agent(config: RecorderConfig, world: World) -> Agent:

@@ -134,6 +134,10 @@ class TunnelPlan:
             shell=None if self.shell is None else self.shell.cut(start, end),
         )
 
+    def stretch(self, wanted: tuple[float, float] | None) -> TunnelPlan:
+        """Return the stretch from a start and of a length at most, m; for None the whole."""
+        return self if wanted is None else self.slice(wanted[0], min(wanted[1], self.length - wanted[0]))
+
     def _furniture(self, lining: Lining, start: float, end: float) -> np.ndarray:
         """Return the furniture whose middle lies between two stations."""
         middle = 0.5 * (lining.furniture[:, :2] + lining.furniture[:, 2:])

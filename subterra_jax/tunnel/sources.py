@@ -192,9 +192,8 @@ def _put(
     """Put a plan on the device; arguments as for `resolve`."""
     if stretch is not None:
         name = lining or plan.default_lining
-        plan = dataclasses.replace(plan, linings={name: plan.lining(name)})  # no more than is needed is cut
-        start, length = stretch
-        plan = plan.slice(start, min(length, plan.length - start))
+        # No more than is needed is cut.
+        plan = dataclasses.replace(plan, linings={name: plan.lining(name)}).stretch(stretch)
     planar = Tunnel.from_plan(plan, lining, reach=reach)
     if not spatial:
         return planar
