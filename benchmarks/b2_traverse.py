@@ -59,8 +59,7 @@ class Command:
     engine: EngineName = "mjx"  # `mjx`, by Warp where it is installed on a GPU, or one way of it; or `mujoco`, in C.
     tunnel: str | None = None  # Tunnels, files or names as `open:val:0-7`; the task's own if not given.
     scene: Path | None = None  # Built scene folder, instead of a tunnel.
-    # Length of the tunnel to use, m; 0 is all of it. A policy trained on all of it has never been near a far mouth; for
-    # a short trial, lower `coverage` instead.
+    # Length of the tunnel to use, m; 0 is all. For a short trial lower `coverage`: no policy has met a far mouth.
     length: float = 0.0
     coverage: float | None = None  # Fraction of the tunnel that counts as success; the task's own if not given.
     out: Path | None = None  # File for the figures, as records.
@@ -110,8 +109,7 @@ def _open(arguments: Command) -> tuple[Any, Any]:
 
 def _drive(arguments: Command, job: int = 0) -> tuple[transfer.Walk, transfer.Row, Any]:
     if arguments.jobs > 1 and hasattr(os, "sched_setaffinity"):  # each on a core, or all would compute on all of them
-        cores = sorted(os.sched_getaffinity(0))
-        os.sched_setaffinity(0, {cores[job % len(cores)]})
+        os.sched_setaffinity(0, np.roll(sorted(os.sched_getaffinity(0)), -job)[:1].tolist())
     env, params = _open(arguments)
     count, levels = params.tunnel.count, np.asarray(env.levels(params))
     index = np.array_split(np.arange(arguments.robots), arguments.jobs)[job]
@@ -174,8 +172,7 @@ def records_of(arguments: Command, figures: dict[str, float]) -> list[Record]:
     task += "" if place is None or ":" in str(place) else f"-in-{Path(place).stem}"
     name = "/".join(["b2", arguments.robot, task, *([] if arguments.robot == "wheels" else [arguments.engine]), agent])
     given = [(field.name, getattr(arguments, field.name), field.default) for field in dataclasses.fields(arguments)]
-    changed = [(key, value) for key, value, usual in given if value != usual and key not in ("out", "jobs")]
-    words = " ".join(f"--{key} {value}" for key, value in changed)
+    words = " ".join(f"--{key} {value}" for key, value, usual in given if value != usual and key not in ("out", "jobs"))
     records = []
     for figure, value in figures.items():
         stem, _, unit = figure.rpartition("_")
