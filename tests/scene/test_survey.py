@@ -10,7 +10,7 @@ from rosbags.rosbag1 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
-from tests.scene.surveyed import Cast, Trajectory, load_cast, load_trajectory, read_tum, survey
+from tests.scene.surveyed import Cast, Trajectory, frames, load_cast, load_trajectory, read_tum, survey
 
 LENGTH, POINTS, EPOCH = 14.0, 2_400, 1_700_000_000
 POINT = np.dtype([("t", "<u4"), ("xyz", "<f4", 3), ("reflectivity", "u1"), ("tag", "u1"), ("line", "u1")])
@@ -96,6 +96,83 @@ def test_returns_lie_on_the_truth_within_the_range_noise(bag: Bag, trajectory: T
     assert error[close].mean() == pytest.approx(0.0, abs=3e-4)
 
 
+def test_the_whole_bore_is_seen_from_mouth_to_mouth(truth: dict, bag: Bag, trajectory: Trajectory) -> None:
+    seen = (bag.points["xyz"] != 0).any(axis=2)
+    time = (EPOCH + 0.1 * np.arange(len(seen))[:, None] + 1e-9 * bag.points["t"])[seen]
+    place, attitude = trajectory.at(time)
+    cloud = place + attitude.apply(bag.points["xyz"][seen])
+    position, tangent, lateral, up = frames(truth)
+    for i in range(0, len(position) - 1, 2):
+        away = cloud - position[i]
+        near = away[abs(away @ tangent[i] - 0.25) <= 0.25]
+        turn = np.arctan2(near @ up[i], near @ lateral[i])
+        assert np.histogram(turn, 18, (-np.pi, np.pi))[0].min() >= 4, truth["station"][i]
+
+
+def test_the_truth_keeps_its_format(truth: dict) -> None:
+    assert (truth["schema"], truth["provenance"], truth["seed"]) == ("subterra.truth/1", "simulated", 4)
+    station, (position, tangent, _, _) = np.array(truth["station"]), frames(truth)
+    np.testing.assert_allclose(station, np.arange(0, LENGTH + 0.1, 0.25))
+    np.testing.assert_allclose(np.linalg.norm(np.diff(position, axis=0), axis=1), 0.25, atol=2e-6)
+    np.testing.assert_allclose(np.gradient(position, 0.25, axis=0)[1:-1], tangent[1:-1], atol=1e-4)
+    assert len(truth["width"]) == len(truth["height"]) == len(station)
+    np.testing.assert_allclose(np.diff(truth["rings"]["station"]), 1.5, atol=1e-5)
+    assert {p["side"] for p in truth["pockets"]} == {"left", "right"}
+    assert 0.8 < np.mean([p["open"] for p in truth["pockets"]]) < 1.0
+
+
+def test_the_gauge_is_between_the_inner_faces(truth: dict, cast: Cast) -> None:
+    tops = [np.array(truth["rails"][side]) for side in ("left", "right")]
+    _, _, lateral, up = frames(truth)
+    for below in (0.014, 0.015, 0.016):
+        start = (0.5 * (tops[0] + tops[1]) - below * up)[1:-1]
+        gap = cast(start, lateral[1:-1]) + cast(start, -lateral[1:-1])
+        np.testing.assert_allclose(gap, 1.435, atol=1e-3)
+    above = 1.0
+    np.testing.assert_allclose(cast(tops[0][1:-1] + above * up[1:-1], -up[1:-1]), above, atol=1e-3)
+
+
+def test_sleepers_stand_above_the_floor_as_told(truth: dict, cast: Cast) -> None:
+    top = np.array(truth["sleepers"]["position"])
+    drop = np.array([0.0, 0.0, -1.0])
+    onto_sleeper = cast(top - drop, drop)
+    between = 0.5 * (top[1:] + top[:-1])
+    onto_floor = cast(between - drop, drop)
+    np.testing.assert_allclose(onto_sleeper, 1.0, atol=1e-3)
+    np.testing.assert_allclose(onto_floor, 1.0 + truth["sleepers"]["top_above_floor"], atol=2e-3)
+
+
+def pocket_rays(pockets: list[dict], truth: dict, shift: float) -> tuple[np.ndarray, np.ndarray]:
+    """Rays that start 0.3 m before the pockets, `shift` off their middle along the girth."""
+    out = np.array([p["outward"] for p in pockets])
+    nearest = [int(np.argmin(abs(np.array(truth["station"]) - p["station"]))) for p in pockets]
+    girth = np.cross(frames(truth)[1][nearest], out)
+    return np.array([p["position"] for p in pockets]) + shift * girth - 0.3 * out, out
+
+
+def test_pockets_are_as_deep_as_told_and_filled_ones_are_flush(truth: dict, cast: Cast) -> None:
+    for opened in (True, False):
+        pockets = [p for p in truth["pockets"] if p["open"] == opened]
+        assert pockets
+        within = cast(*pocket_rays(pockets, truth, 0.05))
+        # The lining around has a roughness of 1 cm, which the pocket's floor shares with its mouth.
+        beside = 0.5 * (cast(*pocket_rays(pockets, truth, 0.10)) + cast(*pocket_rays(pockets, truth, -0.10)))
+        error = within - beside - np.array([p["depth"] * opened for p in pockets])
+        assert np.median(error) == pytest.approx(0.0, abs=1.5e-3)
+        np.testing.assert_allclose(error, 0.0, atol=0.012)
+
+
+def test_nails_cross_the_pockets_that_they_join(truth: dict, cast: Cast) -> None:
+    nailed = [p for p in truth["pockets"] if p["nail"]]
+    assert len(nailed) > 0.8 * len(truth["pockets"])
+    start, out = pocket_rays(nailed, truth, 0.0)
+    along = frames(truth)[1][[int(np.argmin(abs(np.array(truth["station"]) - p["station"]))) for p in nailed]]
+    rings = np.array(truth["rings"]["station"])[[p["ring"] for p in nailed]]
+    towards = np.sign(rings - [p["station"] for p in nailed])[:, None]
+    reach = cast(start + 0.05 * towards * along, out)
+    assert np.median(reach) == pytest.approx(0.3 + 0.06 - 0.014, abs=4e-3)
+
+
 def test_the_prism_is_a_lever_arm_away_from_the_lidar(folder: Path, trajectory: Trajectory) -> None:
     time, rows = read_tum(folder / "prism.tum")
     assert (np.diff(time) < 0).sum() >= 1
@@ -107,3 +184,16 @@ def test_the_prism_is_a_lever_arm_away_from_the_lidar(folder: Path, trajectory: 
     error = rows[:, :3] - (position - attitude.apply(turn.inv().apply(shift)))
     assert error.std() == pytest.approx(0.0025, abs=6e-4)
     assert abs(error.mean(axis=0)).max() < 1.5e-3
+
+
+def test_the_external_imu_turns_with_the_lidar(bag: Bag, trajectory: Trajectory) -> None:
+    gyro = np.array([[getattr(m.angular_velocity, k) for k in "xyz"] for m in bag.imu])
+    force = np.array([[getattr(m.linear_acceleration, k) for k in "xyz"] for m in bag.imu])
+    mount = np.array([[0.99962, 0.027463, 0.002445], [-0.027517, 0.999299, 0.025398], [-0.001746, -0.025456, 0.999674]])
+    # Ground truth has two rows for each sample of the IMU.
+    turn = (trajectory.attitude[1:-3:2].inv() * trajectory.attitude[3::2]).as_rotvec() / 0.01
+    error = gyro[1:] - turn[: len(gyro) - 1] @ mount.T
+    assert (error - error.mean(axis=0)).std() == pytest.approx(5.144e-3, rel=0.1)
+    assert abs(error.mean(axis=0)).max() < 0.015
+    up = trajectory.attitude[0 : 2 * len(force) : 2].as_matrix()[:, 2] @ mount.T
+    assert np.mean((force * up).sum(axis=1)) == pytest.approx(9.80665, abs=0.08)

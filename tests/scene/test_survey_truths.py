@@ -2,11 +2,16 @@
 
 import json
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
+import trimesh
 
 from scene.survey.alignment import lay_out, metro_elements
+from scene.survey.bore import draw_bore
+from scene.survey.config import TruthName
+from scene.survey.furniture import draw_furniture
 from scene.survey.mesh import Part
 from tests.scene.surveyed import Cast, frames, load_cast, survey
 from tests.shared import METRO, needs_metro
@@ -59,6 +64,68 @@ def test_width_and_height_are_what_rays_measure(bare: tuple[Path, dict, Cast]) -
     assert checked > 20
 
 
+def test_sizes_are_those_of_the_class(bare: tuple[Path, dict, Cast]) -> None:
+    _, truth, _ = bare
+    station, width, height = (np.array(truth[k]) for k in ("station", "width", "height"))
+    name = truth["config"]["truth"]
+    sizes = {"horseshoe": (5.8, 5.9), "circle": (5.796, 4.896)}.get(name, (5.65, 6.36))
+    middle = abs(station / LENGTH - 0.5) < 0.1
+    # Slow fields of 5 cm, and roughness of 1 cm or 13 cm: the largest width over all levels is then above the mean.
+    within = 0.9 if name == "irregular" else 0.2
+    np.testing.assert_allclose(width[middle], sizes[0], atol=within)
+    np.testing.assert_allclose(height, sizes[1], atol=max(within, 0.25))
+    if name == "irregular":
+        assert width[-1] - np.median(width) > 2.0
+        smooth = np.array(truth["width_smooth"])[np.searchsorted(station, LENGTH - np.array([6.0, 3.0, 0.0]))]
+        np.testing.assert_allclose(smooth - smooth[0], [0.0, 0.75, 3.0], atol=0.15)  # opens with the square
+        assert not truth["pockets"] + truth["rings"]["station"]
+
+
+def test_the_same_seed_gives_the_same_bytes_and_another_does_not(tmp_path: Path) -> None:
+    one, same, other = (
+        make(tmp_path / n, "--truth", "irregular", "--seed", s) for n, s in (("a", 1), ("b", 1), ("c", 2))
+    )
+    names = sorted(p.name for p in one.iterdir())
+    assert names == ["prism.tum", "truth.json", "truth.ply"]
+    for name in names:
+        assert (one / name).read_bytes() == (same / name).read_bytes()
+        assert (one / name).read_bytes() != (other / name).read_bytes()
+
+
+@pytest.mark.parametrize("correlation", [1.0, 4.0])
+def test_irregular_walls_have_the_spread_and_correlation_asked_for(correlation: float) -> None:
+    station, girth = np.arange(0.0, 400.0, 1.0), np.arange(0.0, 12.0, 0.5)
+    values = np.concatenate([
+        draw_bore(np.random.SeedSequence(s), 351.0, "irregular", correlation).section.roughness.over(station, girth)
+        for s in range(6)
+    ])  # fmt: skip
+    assert values.std() == pytest.approx(0.13, rel=0.04)
+    lag = round(correlation)
+    together = np.mean(values[:-lag] * values[lag:]) / values.var()
+    assert together == pytest.approx(np.exp(-1.0), abs=0.06)
+
+
+def test_furniture_strays_as_configured() -> None:
+    drawn = [draw_furniture(np.random.default_rng(s), 351.0) for s in range(4)]
+    filled = np.concatenate([f.filled[f.pocketed].ravel() for f in drawn])
+    assert filled.mean() == pytest.approx(0.05, abs=3 * np.sqrt(0.05 * 0.95 / len(filled)))
+    depth = np.concatenate([f.depth.ravel() for f in drawn])
+    assert depth.mean() == pytest.approx(0.13, abs=3 * 0.01 / np.sqrt(len(depth)))
+    # Cut at three standard deviations, which takes 1.5 % of the spread.
+    assert depth.std() == pytest.approx(0.01 * 0.987, abs=3 * 0.01 / np.sqrt(2 * len(depth)) + 1e-4)
+    jitter = np.concatenate(
+        [f.sleepers - np.polyval(np.polyfit(n, f.sleepers, 1), n) for f in drawn for n in [np.arange(len(f.sleepers))]]
+    )
+    assert jitter.std() == pytest.approx(0.01 * 0.987, abs=3 * 0.01 / np.sqrt(2 * len(jitter)) + 1e-4)
+    spacing = [np.polyfit(np.arange(len(f.sleepers)), f.sleepers, 1)[0] for f in drawn]
+    np.testing.assert_allclose(spacing, 0.6, atol=3 * 0.01 * np.sqrt(12 / 585**3))
+    assert {len(f.sleepers) for f in drawn} <= {584, 585}
+    pairs = np.concatenate([(~f.filled[f.pocketed]).all(axis=2).ravel() for f in drawn])
+    nails = np.concatenate([f.nails[f.pocketed].ravel() for f in drawn])
+    assert nails[pairs].mean() == pytest.approx(0.97, abs=3 * np.sqrt(0.97 * 0.03 / pairs.sum()))
+    assert not nails[~pairs].any()
+
+
 @needs_metro
 def test_the_metro_alignment_follows_the_real_ring_centres() -> None:
     rows = np.genfromtxt(METRO / "export_best_fit_result.csv", delimiter=",", names=True)
@@ -76,3 +143,24 @@ def test_the_metro_alignment_follows_the_real_ring_centres() -> None:
     assert np.sqrt(np.mean(plan_error**2)) < 0.015
     assert (rise - rise.mean()).std() < 0.012
     assert window.sum() > 48
+
+
+@pytest.mark.parametrize("name", [n for n in get_args(TruthName) if n != "metro"])
+def test_every_surface_faces_the_air(name: TruthName) -> None:
+    bore = draw_bore(np.random.SeedSequence(2), 15.0, name)
+    mesh = bore.mesh()
+    origin = mesh.vertices.mean(axis=0)
+    for solid in (Part.NAIL, Part.SLEEPER, Part.RAIL, Part.FASTENING):
+        faces = mesh.faces[mesh.part == solid]
+        assert bool(len(faces)) == ((name, solid) != ("irregular", Part.NAIL))
+        one = trimesh.Trimesh(mesh.vertices - origin, faces)
+        assert not len(faces) or (one.is_watertight and one.is_winding_consistent and one.volume > 0)
+    shell = trimesh.Trimesh(mesh.vertices - origin, mesh.faces[np.isin(mesh.part, SHELL)])
+    assert shell.is_winding_consistent
+    assert shell.volume < 0  # normals point inwards
+    # Two mouths, and nothing else, are open.
+    edges = shell.edges_sorted[trimesh.grouping.group_rows(shell.edges_sorted, require_count=1)]
+    along = bore.alignment.frames(np.array([0.0, 15.0]))
+    offset = shell.vertices[edges][:, :, None] + origin - along.position
+    assert len(edges) > 0
+    assert abs(np.einsum("emkj,kj->emk", offset, along.tangent)).min(axis=2).max() < 1e-3

@@ -14,7 +14,7 @@ from subterra_jax.lidar3d.beams import level_ring
 from subterra_jax.parts import make_sensor
 from subterra_jax.policies.locate import bends, matching, streams, strips
 from subterra_jax.policies.locate.blocks import DELAY
-from subterra_jax.policies.locate.profiles import Points
+from subterra_jax.policies.locate.profiles import N_BEARINGS, Points, add_points, blank
 from tests.subterra_jax.patches import HALF, N_METRES, drive_past, patches
 
 
@@ -141,3 +141,13 @@ def test_a_bend_is_found_and_its_points_are_put_along_the_axis(radius):
 def test_a_robot_that_stands_learns_no_bend_from_a_niche():
     points = Points(jnp.ones((2, 7)), jnp.zeros((2, 7)).at[0, :3].set(0.9), jnp.ones((2, 7), bool))
     assert float(bends.follow(jnp.zeros(()), points, jnp.zeros(()))) == 0.0
+
+
+def test_a_point_adds_to_the_bins_about_it_and_beyond_the_ends_only_where_they_wrap():
+    shape = (2, N_BEARINGS)
+    points = Points(jnp.zeros(shape), jnp.ones(shape), jnp.ones(shape, bool))
+    cut, wrapped = (add_points(blank(10, 2), points, jnp.zeros(shape), wrapped=on).weight for on in (False, True))
+    np.testing.assert_array_equal(cut[..., 0], 1.0)
+    assert (cut[..., 1] > 0.0).all()
+    assert not cut[..., 9].any()
+    np.testing.assert_array_equal(wrapped[..., 9], wrapped[..., 1])

@@ -4,6 +4,7 @@ import hashlib
 import json
 import re
 import zlib
+from contextlib import nullcontext
 from importlib import resources
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import pytest
 
 import subterra_jax as st
 from benchmarks import reference
+from subterra_jax.host.tunnelfile import read_fields
 from subterra_jax.tunnel import blocks, from_centreline
 from subterra_jax.tunnel.order import order, windows
 from subterra_jax.tunnel.shell import Shell, brick_corners
@@ -219,3 +221,13 @@ def test_what_is_shipped_packs_into_a_wheel_of_10_mb():
         files = [file for file in Path(folder).rglob("*") if file.is_file() and "__pycache__" not in file.parts]
         packed = {file.name: len(zlib.compress(file.read_bytes(), 6)) for file in files}
     assert sum(packed.values()) < 9_900_000, f"the largest is {max(packed, key=packed.__getitem__)}"
+
+
+@pytest.mark.parametrize(("rise", "refused"), [(0.9, False), (1.0, True), (-1.0, True)])
+def test_a_bore_may_rise_steeply_and_not_straight_up(tmp_path, rise, refused):
+    packaged = Path(st.__file__).parent / "data" / "subterra-351.npz"
+    arrays = {name: value for name, value in read_fields(packaged).items() if name not in ("unit", "shell_unit")}
+    arrays["shell_rise"][7] = rise
+    np.savez(tmp_path / "steep.npz", **arrays)
+    with pytest.raises(st.TunnelError, match="above -1 and below 1") if refused else nullcontext():
+        assert st.load_tunnel(tmp_path / "steep.npz", solid=True).shell is not None

@@ -1,6 +1,7 @@
 """The rules of the tasks, and the digests of everything that a score depends on."""
 
 import re
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -8,10 +9,12 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
+from subterra_jax import tasks
 from subterra_jax.host.task_ids import PLANAR
 from subterra_jax.params import digest, plain, task_figures
 from subterra_jax.parts.odometer import OdometryParams
 from subterra_jax.parts.slip import SlipParams, WanderParams
+from subterra_jax.procedural import open_world
 from subterra_jax.rules import GoalParams, RewardParams, StartParams
 
 EXACT = {
@@ -165,3 +168,33 @@ def test_a_hidden_start_is_off_by_the_agreed_length_and_nothing_else_changes():
         assert hidden == {**plain, "start.station_sigma": HIDDEN_START_SIGMA}
     with pytest.raises(ValueError, match="hidden_start and start exclude each other"):
         st.make("Subterra/StopAt-v1", "control", hidden_start=True, start=StartParams(lateral=0.1))
+
+
+def halved(node: Any, path: list[str]) -> Any:
+    """A number, or a tree of params with one of its numbers, half as large."""
+    if not path:
+        return node // 2 if np.issubdtype(np.asarray(node).dtype, np.integer) else node / 2
+    return node.replace(**{path[0]: halved(getattr(node, path[0]), path[1:])})
+
+
+def test_half_of_a_number_of_the_open_world_is_another_digest(monkeypatch):
+    for name, value in (("LENGTH", (150.0, 3000.0)), ("HELD_OUT", {}), ("GRADE_SD", 0.005), ("_HALF", 0.25),
+                        ("MOUNT_TILT", 0.01)):  # fmt: skip
+        with monkeypatch.context() as patched:
+            patched.setattr(open_world, name, value)
+            tasks._benchmark_digest.cache_clear()
+            assert st.constants_digest() != BENCHMARK_SHA256, name
+    tasks._benchmark_digest.cache_clear()
+
+
+@pytest.mark.parametrize("id", [f"Subterra/{name}-v1" for name in ("Traverse", "Obstructed", "Faulted", "Relocalise")])
+def test_half_of_any_constant_is_another_digest(id):
+    env, params = st.make(id, tunnel="subterra-351")
+    before = st.constants_digest(env, params)
+    assert st.constants_digest(*st.make(id, tunnel=params.tunnel)) == before
+    for name, value in task_figures(env, params)["numbers"].items():
+        if not value or name == "vehicle.radius":  # half a radius is refused
+            continue
+        field, *path = name.split(".")
+        changed = halved(getattr(params, field), path)
+        assert st.constants_digest(*st.make(id, tunnel=params.tunnel, **{field: changed})) != before, name
