@@ -80,10 +80,12 @@ class NormalEquations:
             self._gradient(second, jacobian_second, residual)
 
     def _block(self, row: np.ndarray, column: np.ndarray, left: np.ndarray, right: np.ndarray) -> None:
-        place, where = np.unique((row - column) * self._blocks.shape[1] + column, return_inverse=True)
-        total = np.zeros((len(place), self.size, self.size))
-        np.add.at(total, where, np.einsum("mra,mrb->mab", left, right))
-        self._blocks.reshape(-1, self.size, self.size)[place] += total
+        block, place = np.einsum("mra,mrb->mab", left, right), (row - column) * self._blocks.shape[1] + column
+        once, where = np.unique(place, return_inverse=True)
+        if len(once) < len(place):
+            terms, block, place = block, np.zeros((len(once), self.size, self.size)), once
+            np.add.at(block, where, terms)
+        self._blocks.reshape(-1, self.size, self.size)[place] += block
 
     def _lower_band(self) -> np.ndarray:
         """Return the matrix in scipy's lower form: entry (row, column) lies at [row - column, column]."""
