@@ -154,7 +154,7 @@ def stepper(case: Case) -> Stepper:
     device = mjx.put_model(model)
     data = mjx.make_data(device)
     # 300 steps are made: at the usual level the compiler takes twice as long, longer than all of them.
-    step = jax.jit(mjx.step).lower(device, data).compile({"xla_backend_optimization_level": 0})
+    step = jax.jit(mjx.step, compiler_options={"xla_backend_optimization_level": 0})
     return Stepper(lambda state: step(device, state), model, data)
 
 
