@@ -11,10 +11,12 @@ from rich.console import Console
 
 from scene.survey import simulate
 from scene.survey.alignment import draw_railway, lay_out
-from scene.survey.cast import Hits, draw_returns
+from scene.survey.bore import draw_bore
+from scene.survey.cast import Hits, draw_returns, noise_sigma
 from scene.survey.config import SensorErrors, SurveyConfig
 from scene.survey.lidar import Lidar, avia, os1, vlp16
 from scene.survey.mesh import Part
+from scene.survey.section import draw_field
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -78,3 +80,35 @@ def test_a_further_lidar_of_a_long_survey_can_be_simulated_in_another_process(tm
     config = SurveyConfig(tmp_path, length=11.0, sensors=("vlp16", "os1"), scan_every=50)
     said = simulate.simulate(config, Console(quiet=True))
     assert int(said.split(", ")[-1]) > 100_000  # bytes
+
+
+def test_a_field_has_the_spread_and_correlation_asked_for() -> None:
+    rng = np.random.default_rng(1)
+    at = np.array([0.0, 10.0])
+    values = np.array([draw_field(rng, 0.05, 10.0).along(at) for _ in range(4000)])
+    assert values.std() == pytest.approx(0.05, rel=0.03)
+    assert np.corrcoef(values.T)[0, 1] == pytest.approx(np.exp(-1.0), abs=0.04)
+
+
+def test_range_noise_grows_with_range_and_incidence() -> None:
+    def sigma(distance: float, cosine: float) -> float:
+        one = [np.array([v], np.float32) for v in (distance, cosine)]
+        return float(noise_sigma(SensorErrors(), *one)[0])
+
+    assert sigma(0.0, 1.0) == pytest.approx(0.019)
+    assert sigma(50.0, 1.0) == pytest.approx(np.hypot(0.019, 0.005))
+    assert sigma(0.0, np.sqrt(0.5)) == pytest.approx(np.hypot(0.019, 0.002))
+    # The tangent stops at 10.
+    assert sigma(0.0, 0.01) == sigma(0.0, 0.05) == pytest.approx(np.hypot(0.019, 0.02))
+    assert noise_sigma(SensorErrors(), np.full(1, np.inf, np.float32), np.zeros(1, np.float32))[0] < 0.03
+
+
+@pytest.fixture(scope="module")
+def bores():
+    return [draw_bore(np.random.SeedSequence(7), 20.0, "paper", tolerances=on) for on in (False, True)]
+
+
+def test_a_rail_is_150_mm_wide_at_its_foot_16_at_its_web_and_73_at_its_head(bores) -> None:
+    across, up = bores[0].furniture.rail_half.T
+    width = 2e3 * np.interp([0.006, 0.045, 0.080, 0.115, 0.160], up, across)
+    np.testing.assert_allclose(width, [150.0, 16.5, 16.5, 16.5, 73.0], rtol=1e-6)
