@@ -47,9 +47,9 @@ class Trace:
 
     @property
     def ended(self) -> str:
-        """Outcome of the episode in words: `success`, `contact`, `no success`, or after how many steps it was cut."""
+        """Outcome of the episode in words: `success`, `contact`, `no success`, or `cut` by the steps asked for."""
         ended = "success" if self.success else "contact" if self.contact else "no success"
-        return ended if self.over else f"cut after {len(self)} steps"
+        return ended if self.over else "cut"
 
     @property
     def time(self) -> Float[np.ndarray, "rows"]:
