@@ -19,14 +19,14 @@ from tests.subterra_jax.test_open_world import name_of
 
 TABLE = Path(__file__).with_name("values.csv")
 ON_A_WALKWAY = (("universal", 5), ("universal", 30), ("cast", 18))  # the plane cuts one, which is the wall there
+AGENTS = names()  # of the package: tests register more
 
 
 @pytest.mark.parametrize(("kind", "index"), [*((kind, 0) for kind in KINDS), *ON_A_WALKWAY, ("masonry", 7)])
 def test_a_tunnel_is_drawn_as_it_was(kind, index):
     name = name_of(kind, index)
     drawn = open_world.draw(name, 40.0)
-    bore = drawn.bore
-    grid = {name: getattr(bore, name) for name in vars(bore) if name not in ("kind", "layers")}
+    grid = {name: one for name, one in vars(drawn.bore).items() if name not in ("kind", "layers")}
     plan = open_world.plan(name, length=40.0)
     told = {"items": drawn.items, "line": drawn.alignment, "grade": drawn.grade, "bore": grid, "shell": plan.shell}
     check(TABLE, f"{kind}-{index}", {**told, "half_width": plan.half_width, "walls": plan.linings})
@@ -47,4 +47,4 @@ def test_a_model_for_mujoco_is_what_it_was(name):
 @pytest.mark.parametrize("task", ["StopAt", "Relocalise", "Faulted"])
 def test_agents_are_set_as_they_were(task):
     _, params = st.make(f"Subterra/{task}-v1", "control")
-    check(TABLE, f"agents {task}", {name: make_agent(name, params) for name in names()})
+    check(TABLE, f"agents {task}", {name: make_agent(name, params) for name in AGENTS})
