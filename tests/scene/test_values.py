@@ -1,4 +1,4 @@
-"""What surveys draw and the builder finds is what it was; `tests.recorded` says how the tables are written anew."""
+"""Surveys are drawn, and scenes built from them, as they were; `tests.recorded` says how tables are written anew."""
 
 import json
 from dataclasses import replace

@@ -91,7 +91,7 @@ def test_observations_lie_inside_their_space(task):
 
 
 def test_an_episode_is_what_it_was(task, request):
-    """What is sensed, told and rewarded on one way, and all that the state then holds."""
+    """Observations, infos and rewards of one way, and the state at its end, are those of before."""
     env, params, reset, step = task
     obs, state = reset(jax.random.key(3), params)
     told = [(obs, jnp.zeros(()), {})]
