@@ -1,4 +1,4 @@
-"""What the tests agree on among themselves."""
+"""The list of slow tests, held against the files that it names."""
 
 from pathlib import Path
 

@@ -23,7 +23,7 @@ MAY_IMPORT = {
 
 
 class Names(NamedTuple):
-    """What a file's code does with names."""
+    """Names that a file uses, and those that it makes."""
 
     used: set[str]  # that are looked up in the module or in Python
     made: set[str]  # that the module has

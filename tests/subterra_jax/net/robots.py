@@ -45,7 +45,7 @@ def _begun(id, key):
 
 @functools.partial(jax.jit, static_argnums=0)
 def known(env, state, params):
-    """What is true of each robot."""
+    """Returns the true state of each robot, which observations hide."""
     return jax.vmap(env.privileged, (0, None))(state, params)
 
 
