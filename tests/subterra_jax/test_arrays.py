@@ -16,7 +16,6 @@ from subterra_jax.parts.unicycle import VehicleParams
 from subterra_jax.tunnel import Tunnel
 from subterra_jax.tunnel.arrays import ROBOT_RADIUS
 from subterra_jax.tunnel.tunnel import stack
-from tests.subterra_jax.tunnels import straight, tunnel_arrays
 
 LINE = np.column_stack([np.linspace(0.0, 120.0, 121), np.zeros(121)])
 ASIDE = np.array([0.0, 2.5])
@@ -172,27 +171,6 @@ def test_a_tunnel_of_20_km_is_checked_in_a_moment():
     with pytest.raises(st.TunnelError, match="narrower than the robot: at station"):
         st.tunnel.from_polylines(*(np.column_stack([x, side * pinched - 0.02]) for side in (1.0, -1.0)),
                                  centreline=np.column_stack([x, np.zeros_like(x)]))  # fmt: skip
-
-
-@pytest.mark.door
-@pytest.mark.parametrize(
-    ("corrupt", "message"),
-    [
-        (lambda a: {"tangent": -a["tangent"]}, "field 'tangent' is flipped at index 0"),
-        (lambda a: {"tangent": np.where(np.arange(len(a["tangent"]))[:, None] == 9, -1, 1) * a["tangent"]}, "index 9"),
-        (
-            lambda a: {"left_smooth": a["right_smooth"], "right_smooth": a["left_smooth"]},
-            "'left_smooth' lies to the other",
-        ),
-        (lambda a: {"right_pockets": a["left_pockets"]}, "field 'right_pockets' lies to the other side"),
-    ],
-)
-def test_a_file_written_by_hand_is_checked_like_arrays(plan_of, corrupt, message):
-    whole = tunnel_arrays(straight(40.0))
-    plan_of(whole)
-    with pytest.raises(st.TunnelError, match=message) as caught:
-        plan_of({**whole, **corrupt(whole)})
-    assert "\n" not in str(caught.value)
 
 
 def ugly_walls(rng: np.random.Generator) -> list[np.ndarray]:

@@ -84,15 +84,6 @@ def test_a_beam_out_of_a_mouth_reports_exactly_range_max(plan_of):
     assert ranges[4] == pytest.approx(2.825, abs=1e-5)
 
 
-def test_furniture_is_seen(plan_of):
-    arrays = tunnels.tunnel_arrays(tunnels.straight(20.0))
-    box = np.array([[12.0, -0.5], [12.0, 0.5], [13.0, 0.5], [13.0, -0.5], [12.0, -0.5]])
-    arrays["furniture_smooth"] = np.hstack([box[:-1], box[1:]])
-    ranges = scan_at(plan_of(arrays), 10.0, 0.2, 0.0)
-    assert ranges[0] == pytest.approx(2.0, abs=1e-5)
-    check_exact(plan_of(arrays), "smooth", 2000)
-
-
 @pytest.mark.parametrize("n_candidates", [1, 3])
 @pytest.mark.parametrize("fused", [True, False])
 def test_a_beam_along_a_row_of_deep_recesses_is_exact(fused, n_candidates):

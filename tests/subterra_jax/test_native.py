@@ -156,21 +156,3 @@ print(float(lidar3d.meet(relief, at, beams, plan.station[40], 30.0).ranges.sum()
             [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=280
         )
         assert done.returncode == 0, done.stderr[-2000:]
-
-
-def test_a_ray_leaves_a_prism_where_it_meets_the_first_of_its_faces():
-    from subterra_jax.lidar3d.cells import FACES
-    from subterra_jax.native.marching import _leap
-
-    rng = np.random.default_rng(0)
-    for _ in range(40):
-        prism, (y, z), turn = (
-            rng.uniform(1.0, 3.0, len(FACES)),
-            rng.uniform(-0.6, 0.6, 2),
-            rng.uniform(0.0, 2.0 * np.pi),
-        )
-        way = np.array([np.cos(turn), np.sin(turn)])
-        along = np.arange(0.0, 8.0, 1e-3)
-        inside = ((np.array([y, z]) + along[:, None] * way) @ FACES.T <= prism).all(axis=1)
-        assert float(_leap.py_func(prism, y, z, *way)) == pytest.approx(along[~inside][0], abs=2e-3)
-    assert _leap.py_func(prism, 9.0, 0.0, 1.0, 0.0) == 0.0

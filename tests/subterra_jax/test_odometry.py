@@ -6,14 +6,12 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from benchmarks import reference
 from subterra_jax.baselines import stations
 from subterra_jax.parts import odometer as odometry
 from subterra_jax.parts import slip
 from subterra_jax.parts import unicycle as vehicle
 from subterra_jax.parts.slip import WanderParams
 from subterra_jax.tunnel import Tunnel, foot
-from subterra_jax.tunnel.sources import load_tunnel
 from tests.subterra_jax import tunnels
 
 TASK = "Subterra/TraverseShort-v1"
@@ -52,29 +50,6 @@ def test_distance_and_heading_have_noise_of_their_own():
     state = fresh(odometry.Odometer(), jnp.zeros(2), odometry=params)
     after = [odometry.advance_odometry(state, jnp.zeros(2), jnp.float32(0.1), row, params) for row in jnp.eye(2)]
     np.testing.assert_allclose([[one.distance, one.heading] for one in after], [[0.01, 0.0], [0.0, 0.001]], rtol=1e-6)
-
-
-def test_dead_reckoned_headings_stay_within_half_a_turn():
-    state = fresh(odometry.Odometer(), jnp.zeros(2), odometry=odometry.OdometryParams())
-    for _ in range(60):
-        state = odometry.advance_odometry(
-            state, jnp.array([0.0, 1.5]), jnp.float32(0.1), jnp.zeros(2), odometry.OdometryParams()
-        )
-        assert abs(float(state.heading)) <= np.float32(np.pi)
-
-
-def test_a_wandering_error_keeps_its_spread_and_loses_its_memory_over_its_length():
-    first, *later = jax.random.normal(jax.random.key(0), (151, N))
-    value = start = PARAMS.sigma * first
-    advance = jax.jit(jax.vmap(slip.advance_wander, (0, None, 0, None)))
-    for noise in later:
-        value = advance(value, jnp.float32(0.2), noise, PARAMS)
-    start, value = np.asarray(start, np.float64), np.asarray(value, np.float64)
-    # Standard error of a standard deviation: sigma / sqrt(2 n); of a correlation: (1 - r²) / sqrt(n).
-    for sample in (start, value):
-        assert abs(sample.std() - 0.02) < 3 * 0.02 / np.sqrt(2 * N)
-    expected = np.exp(-1.0)
-    assert abs(np.corrcoef(start, value)[0, 1] - expected) < 3 * (1 - expected**2) / np.sqrt(N)
 
 
 def test_the_size_of_the_steps_does_not_matter_to_a_wandering_error():
@@ -151,21 +126,6 @@ def test_headings_stay_within_half_a_turn():
 )
 def test_actions_are_clipped_and_never_rejected(action, obeyed):
     np.testing.assert_array_equal(vehicle.clip_action(jnp.array(action), VEHICLE), np.float32(obeyed))
-
-
-@pytest.mark.parametrize("lining", ["smooth", "pockets"])
-def test_clearance_is_the_distance_to_the_nearest_of_all_segments(lining):
-    plan = load_tunnel()
-    tunnel, rng = Tunnel.from_plan(plan, lining), np.random.default_rng(0)
-    poses = reference.random_poses(plan, 2000, rng, gap=0.15)
-    edge = reference.random_poses(plan, 500, rng, gap=0.15, near_mouths=True)
-    position, station = np.concatenate([poses.position, edge.position]), np.concatenate([poses.station, edge.station])
-    measured = np.asarray(jax.jit(jax.vmap(vehicle.clearance, (None, 0, 0)))(tunnel, position, station))
-    truth = reference.clearance(plan.lining(lining).segments, position)
-    near = truth < 0.79
-    assert near.sum() > 200
-    np.testing.assert_allclose(measured[near], truth[near], atol=1e-5)
-    assert (measured[~near] > 0.78).all()
 
 
 @pytest.mark.parametrize(("lateral", "touches"), [(2.424, False), (2.426, True), (-2.424, False), (-2.426, True)])

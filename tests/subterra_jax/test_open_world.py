@@ -8,9 +8,10 @@ import pytest
 import subterra_jax as st
 from benchmarks import reference
 from subterra_jax.procedural import expand, open_world
+from subterra_jax.procedural.bore import draw_bore
 from subterra_jax.procedural.kinds import KINDS
 from subterra_jax.procedural.open_world import HELD_OUT, SPLITS, draw, kinds_of, levels_of, plan
-from subterra_jax.procedural.surfaces import Grid, Stretches, Waves
+from subterra_jax.procedural.surfaces import Grid, Rings, Stretches, Waves
 from tests.subterra_jax.test_lidar import check_exact
 
 UNSEEN_KINDS = tuple(kind for kind in KINDS if kind not in HELD_OUT)
@@ -19,6 +20,11 @@ SHORT = 60.0  # m of tunnel, enough for most of what is asked here
 
 def name_of(kind: str, index: int = 0) -> str:
     return f"open:{kind}:{'test-unseen' if kind in UNSEEN_KINDS else 'train'}:{900_000 + index}"
+
+
+@pytest.fixture(scope="module")
+def drawn() -> dict:
+    return {kind: draw(name_of(kind), 200.0) for kind in KINDS}
 
 
 def test_what_is_unseen_is_in_no_other_split():
@@ -70,6 +76,66 @@ def test_a_task_longer_than_its_tunnel_is_refused_with_both_lengths():
         st.make("Subterra/StopAt-v1", tunnel=short)
 
 
+@pytest.mark.parametrize("kind", ["straight", "universal"])
+def test_the_nominal_ring_length_is_told_and_the_built_one_is_a_little_longer(kind):
+    excess, spread = [], []
+    for i in range(12):
+        drawn = draw(name_of(kind, i), 400.0)
+        rings = drawn.bore.rings
+        lengths = np.diff(rings.joint)
+        excess.append(lengths.mean() / rings.nominal - 1.0)
+        spread.append(lengths.std())
+        assert 1.0 <= rings.nominal <= 2.0
+        assert rings.nominal == round(rings.nominal, 2)
+    assert min(excess) > -2e-4
+    assert max(excess) < 2.2e-3
+    assert 4e-4 < np.mean(excess) < 1.6e-3
+    assert np.mean(spread) == pytest.approx(1e-3, rel=0.1)
+    tunnel = plan(name_of(kind), solid=False, length=120.0)
+    rings = draw(name_of(kind), 120.0).bore.rings
+    outcome = st.make("Subterra/StopAtShort-v1", tunnel=tunnel)[1].tunnel.ring_pitch  # the entry of the observation
+    assert float(outcome) == pytest.approx(rings.nominal, abs=1e-6)
+
+
+def test_nothing_is_placed_where_a_sensor_looks():
+    """Another mount leaves every pocket and box in its place, and a plane meets a row of pockets only now and then."""
+    met = []
+    for i in range(30):
+        streams = lambda mount, i=i: [np.random.default_rng([i, k]) for k in (0, 1, 2, 3, mount)]  # noqa: E731
+        one, two = (draw_bore(KINDS["straight"], 40.0, ("cabinet", "bracket"), streams(mount)) for mount in (4, 5))
+        assert one.mount != two.mount
+        np.testing.assert_array_equal(one.pocket, two.pocket)
+        for a, b in zip(vars(one.furniture).values(), vars(two.furniture).values(), strict=True):
+            np.testing.assert_array_equal(a, b)
+        plane = one.mount.plane(np.where(np.cos(one.pocket[:, 1]) > 0.0, 1.0, -1.0) * one.section.half_width)
+        met.append(np.any(np.abs(one.heights_of(one.pocket) - plane) < 0.05))
+    assert 3 <= np.sum(met) <= 24
+
+
+def test_mounts_cover_their_range():
+    mounts = [draw(name_of("cast", i), 30.0).bore.mount for i in range(40)]
+    height = np.array([mount.height for mount in mounts])
+    assert height.min() < 0.5
+    assert height.max() > 1.1
+    assert 0.4 <= height.min() < height.max() <= 1.2
+    assert 0.01 < np.std([mount.roll for mount in mounts]) < 0.03
+    assert np.std([mount.lateral for mount in mounts]) == pytest.approx(0.6 / 12**0.5, rel=0.35)
+
+
+def test_straight_joints_line_up_and_those_of_universal_rings_turn(drawn):
+    """Pockets of the joints within a ring, in the middle of each, stand at one set of angles or at many."""
+
+    def angles(kind: str) -> int:
+        bore = drawn[kind].bore
+        joint = np.concatenate([[0.0], bore.rings.joint, [200.0]])
+        middle = 0.5 * (joint[1:] + joint[:-1])
+        in_ring = np.abs(bore.pocket[:, 0, None] - middle).min(axis=1) < 1e-6
+        return len(np.unique(np.round(bore.pocket[in_ring, 1], 3)))
+
+    assert 0 < angles("straight") <= 14
+    assert angles("universal") > 14
+
+
 def test_a_random_surface_has_its_standard_deviation_and_correlation_length_both_ways():
     station, girth = np.arange(0.0, 400.0, 0.1), np.arange(0.0, 3.0, 0.1)
     grid = Grid(station, girth, girth, girth)
@@ -92,11 +158,49 @@ def test_a_random_surface_is_the_sum_of_its_cosines_to_a_nanometre_and_does_not_
     np.testing.assert_array_equal(found, np.round(found, 9))
 
 
+def test_walls_have_the_steps_and_roughness_of_their_kind(drawn):
+    rough = {}
+    for kind, one in drawn.items():
+        bore = one.bore
+        columns = np.array([90 - 20, 20])  # to either side of the crown
+        relief = bore.radius(columns) - bore.radius(columns, smooth=True)
+        rough[kind] = float(np.std(relief))
+    assert max(rough["straight"], rough["universal"], rough["cast"]) < 0.02
+    assert rough["sprayed"] > 0.03
+    assert rough["rock"] > 0.05
+    stretches = next(layer for layer in drawn["cast"].bore.layers if isinstance(layer, Stretches))
+    lengths = np.diff(stretches.joint)
+    assert np.all((lengths > 5.9) & (lengths < 12.2))
+    rounds = next(layer for layer in drawn["sprayed"].bore.layers if isinstance(layer, Stretches))
+    assert 0.1 <= rounds.flare <= 0.3
+    assert 0.7 < np.diff(rounds.joint).mean() < 3.1
+    assert not any(isinstance(layer, Rings) for layer in drawn["sprayed"].bore.layers)
+
+
 def test_a_round_of_blasting_widens_from_its_joint_to_the_next():
     rounds = Stretches(np.array([2.0, 5.0]), np.zeros(3), np.zeros((3, 2)), 0.2)
     grid = Grid(np.array([0.0, 1.0, 2.0, 2.001, 3.5, 5.0, 6.0]), *np.zeros((3, 1)))
     along = rounds.relief(grid, np.array([0]))[:, 0]
     np.testing.assert_allclose(along, [-0.1, 0.0, 0.1, -0.1, 0.0, 0.1, 0.1], atol=2e-4)
+
+
+def test_a_masonry_tunnel_has_refuges_every_20_to_30_m_on_either_side(drawn):
+    niche = drawn["masonry"].bore.niche
+    for side in (1.0, -1.0):
+        own = np.sort(niche[np.sign(np.cos(niche[:, 1])) == side, 0])
+        assert len(own) >= 5
+        assert 17.0 < np.diff(own).mean() < 33.0
+
+
+def test_furniture_is_none_some_or_all():
+    levels = {level: [] for level in open_world.LEVELS}
+    for i in range(14):
+        one = draw(name_of("universal", i), 300.0)
+        levels[one.furniture].append(len(one.items))
+        assert len(one.bore.furniture.start) + len(one.bore.recess) + len(one.bore.benches) > 0 or not one.items
+    assert set(levels["none"]) == {0}
+    assert set(levels["all"]) == {len(KINDS["universal"].fixtures)}
+    assert 0 < np.mean(levels["some"]) < len(KINDS["universal"].fixtures)
 
 
 @pytest.mark.parametrize("kind", ["rock", "straight"])

@@ -14,8 +14,6 @@ import pytest
 import subterra_jax as st
 from benchmarks import reference
 from subterra_jax.host.tunnelfile import read_fields
-from subterra_jax.tunnel import blocks, from_centreline
-from subterra_jax.tunnel.order import order, windows
 from subterra_jax.tunnel.shell import Shell, brick_corners
 from subterra_jax.tunnel.sources import PACKAGED, tunnel_digest
 from tests.subterra_jax import tunnels
@@ -37,6 +35,8 @@ def arrays():
         ("centre", lambda a: a[:-1]),
         ("centre", lambda a: np.where(np.arange(len(a))[:, None] == 7, np.nan, a)),
         ("tangent", lambda a: 2.0 * a),
+        ("tangent", lambda a: a * np.where(np.arange(len(a)) == 7, 1.0011, 1.0)[:, None]),
+        ("tangent", lambda a: a * np.where(np.arange(len(a)) == 9, -1.0, 1.0)[:, None]),
         ("elevation", lambda a: None),
         ("half_width", lambda a: -a),
         ("lidar_height", lambda a: np.zeros(2)),
@@ -46,6 +46,7 @@ def arrays():
         ("left_smooth", lambda a: None),
         ("left_smooth", lambda a: a[:1]),
         ("right_pockets", lambda a: a[:, :1]),
+        ("right_smooth", lambda a: np.add(a, [0.0, 6.0])),
         ("right_station_smooth", lambda a: a[::-1]),
         ("left_station_pockets", lambda a: a[1:]),
         ("furniture_pockets", lambda a: np.zeros((3, 3))),
@@ -116,25 +117,6 @@ def test_the_packaged_pockets_cross_the_plane_of_the_lidar_on_both_walls():
         recessed = away > 0.6 * depth
         rings = np.unique(np.round(wall.station[recessed] / plan.ring_pitch))
         assert len(rings) > 0.8 * plan.length / plan.ring_pitch
-
-
-def test_a_pocket_gets_a_lid_and_a_deep_wide_niche_does_not():
-    def wall(depth: float) -> np.ndarray:
-        return np.array([[0.0, 0.0], [0.5, 0.0], [0.5, depth], [1.5, depth], [1.5, 0.0], [2.0, 0.0]])
-
-    pieces = np.stack([wall(0.13), wall(1.0), wall(0.13)])
-    hull, size = blocks.add_lids(pieces, np.full(3, 6), np.array([-1.0, -1.0, 0.0]))
-    assert size.tolist() == [2, 6, 6]
-    np.testing.assert_array_equal(hull[0, :2], [[0.0, 0.0], [2.0, 0.0]])
-
-
-def test_a_beam_visits_few_blocks_of_a_straight_tunnel():
-    """The bound at a block of a straight tunnel is its own near end, but for the block beside it."""
-    plan = from_centreline([[0.0, 0.0], [200.0, 0.0]], 2.5)
-    cut = blocks.build_blocks(plan, plan.lining("smooth"), 2.0, 16)
-    visits = order(plan, cut, *windows(plan, cut, 30.0))
-    assert np.hypot(*cut.half.T).max() == pytest.approx(1.0, abs=0.3)
-    assert min(visits.ahead.min(), visits.behind.min()) > -2.1
 
 
 DATA = resources.files("subterra_jax") / "data"

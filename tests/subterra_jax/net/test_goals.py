@@ -215,15 +215,6 @@ def test_where_a_beam_ends_on_a_box_the_robot_would_touch_it():
     assert standing_there(plain, empty)[1]["contact"].mean() < 0.3
 
 
-def test_a_robot_that_drives_blindly_among_boxes_runs_into_them():
-    contacts = {}
-    for id in ("Subterra/StopAt-v1", "Subterra/Obstructed-v1"):
-        _, series = robots.driven(id, robots.placed(id, among_boxes(id, MANY), 10.0), 150)
-        contacts[id] = series["contact"].any(axis=0).mean()
-    assert contacts["Subterra/StopAt-v1"] == 0.0
-    assert 0.3 < contacts["Subterra/Obstructed-v1"] < 0.99
-
-
 def test_boxes_are_as_many_and_as_large_as_stated():
     id, points = "Subterra/Obstructed-v1", 150
     _, params, *_ = robots.made(id)
