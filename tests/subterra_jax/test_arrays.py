@@ -12,9 +12,7 @@ import pytest
 import subterra_jax as st
 from benchmarks import reference
 from subterra_jax import lidar
-from subterra_jax.parts.unicycle import VehicleParams
 from subterra_jax.tunnel import Tunnel
-from subterra_jax.tunnel.arrays import ROBOT_RADIUS
 from subterra_jax.tunnel.tunnel import stack
 
 LINE = np.column_stack([np.linspace(0.0, 120.0, 121), np.zeros(121)])
@@ -110,10 +108,6 @@ def test_a_task_runs_in_a_tunnel_from_arrays_and_in_a_stack_of_them(task):
     assert jax.tree.all(jax.tree.map(np.array_equal, same, params))
 
 
-def test_the_robot_is_as_wide_as_the_vehicle():
-    assert VehicleParams().radius == ROBOT_RADIUS
-
-
 ACROSS = [[60.0, -2.5, 60.0, 2.5]]
 WALL_ACROSS = np.concatenate([LEFT[:60], [[60.0, -1.0]], LEFT[61:]])
 NARROW = np.concatenate([LEFT[:60], [[60.0, 0.3]], LEFT[61:]])
@@ -148,8 +142,8 @@ RING = 20.0 * np.column_stack([np.cos(np.linspace(0.0, 7.0, 200)), np.sin(np.lin
         (lambda: st.tunnel.from_centreline(LINE[:1], 2.5), "at least 2 vertices"),
         (lambda: st.tunnel.from_centreline(LINE[:, :1], 2.5), r"shape \(n, 2\)"),
         (lambda: st.tunnel.from_centreline("line", 2.5), "must hold numbers"),
-        (lambda: st.tunnel.from_centreline(LINE, 2.5, pockets=[[60.0, 2, 0.2, 0.1]]), "side of a pocket"),
-        (lambda: st.tunnel.from_centreline(LINE, 2.5, pockets=[[60.0, 1, 0.2, -0.1]]), "must be positive"),
+        (lambda: st.tunnel.from_centreline(LINE, 2.5, pockets=[[50, 1, 1, 0.1], [60, 2, 1, 0.1]]), "side of"),
+        (lambda: st.tunnel.from_centreline(LINE, 2.5, pockets=[[50, 1, 1, 0.1], [60, 1, 1, 0]]), "be positive"),
         (lambda: st.tunnel.from_centreline(LINE, 2.5, pockets=[[60, 1, 1, 0.1], [60.5, 1, 1, 0.1]]), "overlap"),
         (lambda: st.tunnel.from_centreline(LINE, 2.5, pockets=[[130.0, 1, 0.2, 0.1]]), "outside the tunnel"),
     ],
@@ -158,6 +152,27 @@ def test_a_mistake_is_refused_in_one_sentence(make, message):
     with pytest.raises(st.TunnelError, match=message) as caught:
         make()
     assert "\n" not in str(caught.value)
+
+
+HAND, POLY = st.tunnel.from_centreline, partial(st.tunnel.from_polylines, centreline=LINE)
+BOUNDS = [  # of a number: what is made of it, a value that is taken and one that is not, and why
+    (lambda back: POLY([*LEFT[:61], LEFT[60] + [-back, 0.3], *LEFT[61:]], RIGHT), 0.99, 1.01, "left doubles back at"),
+    (lambda by: POLY(np.add(LEFT, [by, 0.0]), RIGHT), 2.99, 3.01, "left goes from station 3.0"),
+    (lambda by: POLY(LEFT, np.subtract(RIGHT, [by, 0.0])), 2.99, 3.01, "right goes from station -3.0 to 117.0"),
+    (lambda y: POLY([*LEFT[:60], [60.0, y], *LEFT[61:]], RIGHT), 0.42, 0.39, "narrower than the robot: at station 60"),
+    (lambda y: POLY([*LEFT[:60], [60.0, y], *LEFT[61:]], RIGHT), 0.42, 0.12, "a wall stands across"),
+    (lambda width: HAND(LINE, width), 0.401, 0.4, "narrower than the robot: half_width is 0.40"),
+    (lambda x: HAND(LINE, 2.5, pockets=[[60, 1, 1, 0.1], [x, 1, 1, 0.1]]), 61.001, 61.0, "overlap"),
+    (lambda x: HAND(LINE, 2.5, pockets=[[x, 1, 1, 0.1]]), 0.501, 0.5, "lies outside the tunnel"),
+    (lambda x: HAND(LINE, 2.5, pockets=[[x, -1, 1, 0.1]]), 119.499, 119.5, "lies outside the tunnel"),
+]
+
+
+@pytest.mark.parametrize(("make", "taken", "refused", "message"), BOUNDS)
+def test_a_number_is_taken_up_to_its_bound(make, taken, refused, message):
+    assert make(taken).length == pytest.approx(120.0)
+    with pytest.raises(st.TunnelError, match=message):
+        make(refused)
 
 
 def test_a_tunnel_of_20_km_is_checked_in_a_moment():

@@ -72,15 +72,6 @@ def test_deep_recesses_rock_and_furniture_are_met(name: str | None, lining: str 
     assert (found.n_wrong, found.max_error < 1e-3) == (0, True)
 
 
-def test_blocks_of_any_size_give_the_same_ranges(plan: st.TunnelPlan, monkeypatch) -> None:
-    poses = reference.random_poses(plan, 64, np.random.default_rng(5))
-    usual = scan_by_kernel(Tunnel.from_plan(plan), poses)
-    monkeypatch.setattr("subterra_jax.tunnel.tunnel.BLOCK_LENGTH", 20.0)
-    monkeypatch.setattr("subterra_jax.tunnel.tunnel.MOST_SEGMENTS", 90)
-    large = scan_by_kernel(Tunnel.from_plan(plan), poses)
-    assert np.mean(np.abs(large - usual) < 1e-4) > 0.999
-
-
 def test_ranges_are_clipped_at_the_largest(plan: st.TunnelPlan) -> None:
     poses = reference.random_poses(plan, 32, np.random.default_rng(1))
     ranges = scan_by_kernel(Tunnel.from_plan(plan), poses, range_max=4.0)

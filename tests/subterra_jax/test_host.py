@@ -21,13 +21,14 @@ import tyro
 import subterra_jax
 import subterra_jax as st
 from subterra_jax import list_tasks, policies
-from subterra_jax.__main__ import COMMANDS
+from subterra_jax.__main__ import COMMANDS, main
 from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
 from subterra_jax.host.errors import OutputError, SubterraError
 from subterra_jax.host.files import replace_file
 from subterra_jax.host.task_ids import no_task
 from subterra_jax.host.versions import VERSION, other_schema
 from subterra_jax.policies.files import PolicyError
+from subterra_jax.tunnel.sources import named
 from train import checkpoint
 from train.checkpoint import CheckpointError
 from train.world import library_versions
@@ -317,3 +318,23 @@ def test_an_id_that_never_was_lists_those_there_are():
     assert no_task("Fly", known) == "no task 'Fly'; there are Subterra/StopAt-v1, Subterra/Return-v1"
     with pytest.raises(gymnasium.error.VersionNotFound, match="StopAt"):
         gymnasium.make("subterra_jax:Subterra/StopAt-v7")
+
+
+def test_the_command_becomes_the_module_that_it_names(monkeypatch, capsys):
+    ran, _ = [], monkeypatch.setenv("PYTHONPATH", "elsewhere")
+    monkeypatch.setattr(os, "execve", lambda program, words, env: ran.append((words[1:], env["PYTHONPATH"])))
+    main(["view", "--task", "StopAt"])
+    path = f"{Path(st.__file__).parents[1]}{os.pathsep}elsewhere"
+    assert ran == [(["-m", "subterra_jax.viewer", "--task", "StopAt"], path)]
+    monkeypatch.setitem(COMMANDS, "demo", ("benchmarks.nowhere", "is not here"))
+    assert (main(["demo"]), main(["tasks"])) == (2, 0)
+    assert capsys.readouterr().out.split()[:2] == ["Subterra/Traverse-v1", "Subterra/TraverseShort-v1"]
+
+
+def test_a_scene_brings_its_tunnel_and_goes_with_no_other(tmp_path):
+    (tmp_path / "scene.xml").touch()
+    assert [named("metro", None), named(None, None)] == ["metro", None]
+    assert {named(None, place) for place in (tmp_path, tmp_path / "scene.xml")} == {tmp_path / "tunnel.npz"}
+    for tunnel, scene, said in (("metro", tmp_path, "not both"), (None, tmp_path / "no", "no such scene")):
+        with pytest.raises(st.TunnelError, match=said):
+            named(tunnel, scene)

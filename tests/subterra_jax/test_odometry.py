@@ -64,16 +64,6 @@ def test_the_size_of_the_steps_does_not_matter_to_a_wandering_error():
     np.testing.assert_allclose(stations._process(PARAMS, jnp.float32(1e6)), [0.0, 4e-4], rtol=1e-6)
 
 
-def test_slips_have_the_stated_spread_and_each_a_draw_of_its_own():
-    noise = jax.random.normal(jax.random.key(1), (N, 3))
-    states = jax.vmap(lambda row: fresh(slip.Slip(), row, slip=slip.SlipParams()))(noise)
-    motion = np.asarray(jax.vmap(slip.true_motion, (None, 0))(jnp.array([2.0, 0.1]), states), np.float64)
-    for channel, expected in enumerate((2.0 * np.hypot(0.02, 0.02), 0.002)):
-        assert abs(motion[:, channel].std() - expected) < 3 * expected / np.sqrt(2 * N)
-    errors = np.corrcoef([states.gain, states.yaw, states.wander])
-    np.testing.assert_allclose(errors, np.eye(3), atol=4.5 / np.sqrt(N))  # of independent numbers: 1 / sqrt(N)
-
-
 def test_a_robot_told_to_stand_stands():
     state = fresh(slip.Slip(), jnp.array([3.0, 3.0, 3.0]), slip=slip.SlipParams())
     np.testing.assert_array_equal(slip.true_motion(jnp.zeros(2), state), np.zeros(2))

@@ -1,6 +1,7 @@
 """Centrelines and random lines of generated tunnels, names of tunnels, and the control."""
 
 import dataclasses
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -9,9 +10,12 @@ import pytest
 import subterra_jax as st
 from benchmarks import reference
 from subterra_jax.procedural.geometry import Alignment, draw_alignment, wander
-from subterra_jax.procedural.open_world import LINE
+from subterra_jax.procedural.open_world import LINE, SPLITS
 from subterra_jax.tunnel import sources
 from subterra_jax.tunnel.sources import resolve
+from tests.recorded import check
+
+TABLE = Path(__file__).with_name("values.csv")
 
 
 @pytest.fixture(scope="module")
@@ -101,6 +105,9 @@ def test_where_no_tunnel_is_named_it_is_the_open_worlds_and_the_papers_for_the_p
     assert st.tasks.tunnel_for("Subterra/Traverse-v1") == "subterra-351"
     assert st.tasks.tunnel_for("Subterra/Traverse-v1", split="val") == "open:val:0-11"
     assert st.tasks.tunnel_for("Subterra/StopAt-v1", "control") == "control"
+    short = {split: st.tasks.tunnel_for("Subterra/StopAt-v1", split=split, spatial=True) for split in (None, *SPLITS)}
+    check(TABLE, "short tunnels", {str(split): names for split, names in short.items()})
+    assert st.tasks.first_tunnel("Subterra/StopAt-v1", spatial=True) == short[None][0]
     with pytest.raises(ValueError, match="no split 'test'; there are train, val, test-seen, test-unseen"):
         st.make("Subterra/StopAt-v1", split="test")
     with pytest.raises(ValueError, match="either a tunnel or a split, got both 'control' and 'val'"):
@@ -152,3 +159,4 @@ def test_the_cache_does_without_a_folder_survives_damage_and_does_not_grow_for_e
     monkeypatch.setattr(sources, "_MOST", file.stat().st_size + 10)
     afresh("open:cast:val:6")
     assert len(list(file.parent.glob("*.pickle"))) == 1
+    assert not file.exists()  # the one that was not used for longer

@@ -1,6 +1,7 @@
 """Rough walls as triangles: every cell lists what goes through it, and rolled and wide beams meet what is there."""
 
 import dataclasses
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -13,10 +14,14 @@ from subterra_jax import lidar, lidar3d
 from subterra_jax.host.errors import TunnelError
 from subterra_jax.host.unrolled import delaunay
 from subterra_jax.lidar3d import beams, cells, relief, rolled, surface
-from subterra_jax.lidar3d.relief import Relief
+from subterra_jax.lidar3d.relief import ARRAYS, Relief
+from subterra_jax.lidar3d.space import Space
 from subterra_jax.lidar3d.surface import split_boxes
 from subterra_jax.procedural import open_world
+from tests.recorded import check
 from tests.subterra_jax import surfaces
+
+TABLE = Path(__file__).with_name("values.csv")
 
 
 @pytest.fixture(scope="module")
@@ -74,19 +79,15 @@ def test_boxes_are_told_from_other_triangles():
 def test_a_surface_too_fine_for_the_integers_gets_shorter_blocks_or_is_refused(monkeypatch):
     axis = surface.Axis(**surfaces.axis_of(16.0))
     tube = surface.Triangles(*surfaces.tube(surfaces.axis_of(16.0), 2.0, 64, 65))
-    monkeypatch.setattr(cells, "MOST_VERTICES", 600)
-    assert len(cells.sort_triangles(axis, tube, 4.0).low) > 4
+    monkeypatch.setattr(cells, "MOST_VERTICES", 800)
+    assert len(cells.sort_triangles(axis, tube, 4.0).low) == 8  # halved once
     monkeypatch.setattr(cells, "MOST_VERTICES", 60)
     with pytest.raises(TunnelError, match="too fine for the LiDAR: 8192 triangles over 16 m"):
         cells.sort_triangles(axis, tube, 4.0)
 
 
 def test_what_cannot_be_stacked_is_refused():
-    axis, tube = (
-        surface.Axis(**surfaces.axis_of(8.0)),
-        surface.Triangles(*surfaces.tube(surfaces.axis_of(8.0), 2.0, 8, 9)),
-    )
-    one = Relief.from_triangles(axis, tube)
+    one = Relief.from_plan(upright())
     with pytest.raises(ValueError, match="at least one relief"):
         relief.stack_reliefs([])
     with pytest.raises(ValueError, match="relief 0 is a stack of 2"):
@@ -99,6 +100,41 @@ def test_a_surface_away_from_the_axis_is_refused():
     far = surfaces.box((500.0, 0.0, 0.0), (1.0, 1.0, 1.0))
     with pytest.raises(ValueError, match="no triangle lies along the axis"):
         Relief.from_triangles(surface.Axis(**axis), surface.Triangles(*far))
+
+
+def upright():
+    """A bend with a grade, a pocket and furniture, of which no shell is known."""
+    station = np.linspace(0.0, 12.0, 13)
+    line = 40.0 * np.stack([np.sin(station / 40.0), 1.0 - np.cos(station / 40.0)], axis=-1)
+    plan = st.tunnel.from_centreline(line, 2.5, pockets=[[6.0, 1, 0.4, 0.3]], elevation=0.04 * station)
+    across = np.array([[4.0, -1.0, 5.0, -1.2]])
+    return dataclasses.replace(plan, linings={"built": dataclasses.replace(plan.lining("pockets"), furniture=across)})
+
+
+BORES = {
+    "furnished": lambda: (st.load_tunnel("metro").slice(100.0, 9.0), "furnished"),
+    "rough": lambda: (open_world.plan("open:rock:test-unseen:49", variants=("built",), length=7.0), "built"),
+    "upright": lambda: (upright(), "built"),
+}
+
+
+def told(space):
+    """What the space of a tunnel holds, its words taken apart."""
+    one, (frame, link, cell, entry, vertex) = space.relief, (np.asarray(getattr(space.relief, n)) for n in ARRAYS[:-1])
+    code, half = np.sort(entry.view(np.uint32)).astype(int), np.ascontiguousarray(cell).view(np.uint16).reshape(-1, 4)
+    return {
+        "numbers": [np.asarray(one.length), np.asarray(one.first_block), np.asarray(one.n_blocks)],
+        "frame": np.split(frame, [3, 12, 20, 21, 22, 23, 24, 25], axis=1),
+        **{"link": link, "cell": half, "entry": np.stack([code >> 20, code >> 10 & 1023, code & 1023], axis=-1)},
+        **{"vertex": np.hstack([vertex >> 10, vertex & 1023]), "ground": np.asarray(space.ground)},
+        "box": np.asarray(one.box).reshape(-1, 4),
+    }
+
+
+def test_a_surface_goes_to_the_device_as_it_did():
+    spaces = {name: Space.from_plan(*make()) for name, make in BORES.items()}
+    for name, space in (spaces | {"stack": Space.join(list(spaces.values()))}).items():
+        check(TABLE, f"space {name}", told(space))
 
 
 def as_set(faces: np.ndarray) -> set[tuple[int, ...]]:
@@ -158,13 +194,13 @@ def test_a_packaged_tunnel_is_raised_along_its_grade_and_a_lidar_above_the_crown
         lidar3d.Relief.from_plan(dataclasses.replace(plan, lidar_height=6.5))
 
 
-@pytest.mark.parametrize(
-    ("pattern", "count"),
-    [(beams.planar(16), 16), (beams.spinning(np.linspace(-0.3, 0.3, 16), 1800), 28_800), (beams.rosette(), 24_000)],
-)
-def test_beams_are_unit_vectors_and_as_many_as_the_sensor_has(pattern, count):
-    assert pattern.shape == (count, 3)
-    np.testing.assert_allclose(np.linalg.norm(pattern, axis=1), 1.0, atol=1e-6)
+def test_the_level_ring_is_the_one_above_the_middle_and_a_scan_of_one_row_is_level_as_a_whole():
+    image, row = np.arange(256), np.arange(24)
+    assert beams.level_ring(image, (4, 64)).tolist() == list(range(128, 192, 4))
+    assert beams.level_row(image, (4, 64)).tolist() == list(range(128, 192))
+    assert beams.level_ring(image[:128], (2, 64)).tolist() == list(range(64, 128, 4))
+    np.testing.assert_array_equal(beams.level_ring(row, (1, 24)), row)
+    assert [beams.n_level(shape) for shape in ((4, 64), (2, 64), (1, 24))] == [16, 16, 24]
 
 
 def test_the_planar_pattern_is_that_of_the_planar_lidar():

@@ -121,6 +121,7 @@ def test_privileged_state_tells_what_observations_do_not():
 def test_a_task_that_cannot_be_is_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         st.make("Subterra/StopAtShort-v1", **arguments)
+    st.make("Subterra/StopAtShort-v1", tunnel=st.tunnel.from_centreline([[0.0, 0.0], [90.0, 0.0]], 2.5))  # just so long
 
 
 HIDDEN_START_SIGMA = 3.0

@@ -75,8 +75,7 @@ ON_DEVICE = {
     "pockets": lambda: (st.load_tunnel().slice(101.3, 40.0), "pockets"),
     "furnished": lambda: (st.load_tunnel("metro").slice(40.0, 33.3), "furnished"),
     "refuges": lambda: (st.load_tunnel("open:masonry:train:0").slice(100.0, 20.0), "built"),
-    "uneven": lambda: (uneven(), None),
-    "hand": lambda: (drawn_by_hand(), None),
+    **{name: lambda name=name: (BY_HAND[name](), None) for name in BY_HAND},
 }
 
 

@@ -173,6 +173,7 @@ def test_from_t1_on_the_plant_slips_by_2_percent_an_episode_and_2_percent_that_w
         robots.assert_covariance(slip[0], slip[lag], 0.02**2 + wandering(10.0 * lag, 0.02))
     robots.assert_covariance(slip[0], slip[1] - slip[9], wandering(10.0, 0.02) - wandering(90.0, 0.02))
     robots.assert_covariance(yaw, yaw, 0.002**2)
+    robots.assert_covariance(yaw, slip[0], 0.0)  # each has a draw of its own
 
 
 def test_from_t1_on_the_odometer_errs_by_2_percent_an_episode_and_1_percent_that_wanders_over_30_metres():
