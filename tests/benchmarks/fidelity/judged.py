@@ -29,11 +29,17 @@ def lasting(make: Callable[..., Case]) -> Callable[..., Case]:
 
 
 @lasting
-def against(right: tube.Tube, heard: bool = False, **changes) -> Case:
-    """A tube with other dimensions judged against a right one; `heard` by its recording alone."""
+def against(right: tube.Tube, heard: bool = False, box: tuple[float, ...] = (), beams: int = 6000, **changes) -> Case:
+    """A tube with other dimensions judged against a right one; `heard` by its recording alone, of so many beams.
+
+    `box` puts in boxes, each by its size along, left and up and by the station, left and up of its middle.
+    """
     if heard:
-        return replace(against(right, **changes), truth=None, cache={})
-    return tube.case(right, replace(right, **changes))
+        return replace(against(right, False, box, beams, **changes), truth=None, cache={})
+    if box:
+        bodies = [tube.box(right, *box[k + 3 : k + 6], box[k : k + 3]) for k in range(0, len(box), 6)]
+        return tube.corrupted(against(right, beams=beams, **changes), extra=trimesh.util.concatenate(bodies))
+    return tube.case(right, replace(right, **changes), beams=beams)
 
 
 @lasting

@@ -73,15 +73,6 @@ def test_the_recording_alone_shows_sleepers_and_rails_where_they_are():
     assert measure("trk_gauge_mean_err", heard()).reason.startswith("K:")
 
 
-def test_where_the_recording_shows_no_track_there_is_nothing_to_match():
-    bare = replace(tube.case(replace(SHORT, track=False), SHORT), truth=None)
-    for id in ("trk_sleeper_f1", "trk_gauge_mean_err", "trk_rail_lateral_rmse"):
-        assert measure(id, bare).value is None
-        assert not measure(id, bare).failed
-    # Sleepers that the truth has not match nothing.
-    assert measure("trk_sleeper_f1", tube.case(replace(SHORT, track=False), SHORT)).value == 0.0
-
-
 @pytest.fixture(scope="module")
 def good(tmp_path_factory):
     return Case(load_candidate(tubescene.write(tmp_path_factory.mktemp("scene") / "tube", SHORT)))

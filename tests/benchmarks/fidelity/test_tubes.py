@@ -1,6 +1,7 @@
 """Tubes with one dimension wrong: what each metric says of it, by dimension; a copy is right within noise."""
 
 import json
+from dataclasses import replace
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -8,7 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.benchmarks.fidelity.judged import BARE, DEFAULT, PLAIN, SHORT, against, category, judged, raw
+from benchmarks.fidelity.case import Case
+from tests.benchmarks.fidelity.judged import BARE, DEFAULT, PLAIN, SHORT, against, category, judged, measure
+from tests.benchmarks.fidelity.tube import Tube
 
 Bounds = tuple[float, float]
 
@@ -18,18 +21,25 @@ def about(value: float, by: float = 1e-9) -> Bounds:
 
 
 def below(value: float) -> Bounds:
-    return -inf, np.nextafter(value, -inf)
+    return -1e99, np.nextafter(value, -inf)
 
 
 def above(value: float) -> Bounds:
-    return np.nextafter(value, inf), inf
+    return np.nextafter(value, inf), 1e99
 
 
 def bounds(text: str) -> tuple[str, Bounds]:
     """A metric, and the least and the largest value that it may have."""
     metric, sign, *numbers = text.split()
+    if sign in WITHOUT:
+        return metric, (WITHOUT[sign], WITHOUT[sign])
     value, *other = map(float, numbers)
     return metric, {"<": below, ">": above, "≈": about, "in": lambda low, high: (low, high)}[sign](value, *other)
+
+
+def value_of(metric: str, case: Case) -> float:
+    value = measure(metric, case)
+    return WITHOUT["failed" if value.failed else "missing"] if value.value is None else value.value
 
 
 def row_of(line: str) -> tuple[Any, dict[str, Any], dict[str, Bounds]]:
@@ -39,7 +49,16 @@ def row_of(line: str) -> tuple[Any, dict[str, Any], dict[str, Bounds]]:
     return TUBES[right], changes, dict(map(bounds, metrics.split("; ")))
 
 
-TUBES = {"BARE": BARE, "PLAIN": PLAIN, "SHORT": SHORT, "DEFAULT": DEFAULT}
+FLAT = Tube(length=12.0, bend=inf, grade=0.0, variation=0.0, depth=0.0, track=False)
+WITHOUT = {"failed": inf, "missing": -inf}
+TUBES = {
+    "FLAT": FLAT,
+    "LOW": replace(FLAT, width=2.4, height=1.3),
+    "BARE": BARE,
+    "PLAIN": PLAIN,
+    "SHORT": SHORT,
+    "DEFAULT": DEFAULT,
+}
 ROWS = Path(__file__).with_name("tubes.txt").read_text(encoding="utf-8").splitlines()
 KNOWN = [row_of(line) for line in ROWS if not line.startswith("#")]
 
@@ -49,7 +68,7 @@ KNOWN = [row_of(line) for line in ROWS if not line.startswith("#")]
 )
 def test_a_tube_of_other_dimensions_has_the_values_that_follow(right, changes, known) -> None:
     case = judged(**changes) if right == DEFAULT else against(right, **changes)
-    values = {id: raw(id, case) for id in known}
+    values = {id: value_of(id, case) for id in known}
     assert {id: values[id] for id, (low, high) in known.items() if not low <= values[id] <= high} == {}
 
 

@@ -30,7 +30,7 @@ def surfaces(tube: Tube) -> tuple[trimesh.Trimesh, trimesh.Trimesh, np.ndarray]:
 def track(tube: Tube) -> Track:
     """Sleepers 2.5 m long, rails of three boxes a stretch, pads."""
     top = tube.floor(tube.sleepers) + tube.rise
-    sleepers = [_box(tube, s, 0.0, z - 0.105, (0.2, 2.5, 0.21)) for s, z in zip(tube.sleepers, top, strict=True)]
+    sleepers = [box(tube, s, 0.0, z - 0.105, (0.2, 2.5, 0.21)) for s, z in zip(tube.sleepers, top, strict=True)]
     rails, fastenings, rail = [], [], {"left": [], "right": []}
     offset = (tube.gauge + 0.073) / 2
     ends = np.linspace(0.0, tube.length, int(tube.length / 1.5) + 1) if tube.track else np.empty(0)
@@ -39,20 +39,21 @@ def track(tube: Tube) -> Track:
             base = tube.floor((a + b) / 2) + tube.rise + 0.01
             for width, low, high in ((0.15, 0.0, 0.012), (0.0165, 0.012, 0.1275), (0.073, 0.1275, 0.176)):
                 middle, size = base + (low + high) / 2, (b - a, width, high - low)
-                rails.append(_box(tube, (a + b) / 2, side * offset, middle, size))
+                rails.append(box(tube, (a + b) / 2, side * offset, middle, size))
             inner = side * (offset - 0.0365)
             for end in (-(b - a) / 2, (b - a) / 2):
                 point = tube.point((a + b) / 2, inner, base + 0.176)[0] + end * tube.frames((a + b) / 2)[1][0]
                 rail[name].append(point)
         for s, z in zip(tube.sleepers, top, strict=True):
-            fastenings.append(_box(tube, s, side * offset, z + 0.005, (0.18, 0.15, 0.01)))
+            fastenings.append(box(tube, s, side * offset, z + 0.005, (0.18, 0.15, 0.01)))
     points = {name: np.asarray(ends).reshape(-1, 3) for name, ends in rail.items()}
     tops = tube.point(tube.sleepers, np.zeros(len(tube.sleepers)), top).reshape(-1, 3)
     meshes = [concatenate_meshes(parts) for parts in (sleepers, rails, fastenings)]
     return Track(tops, meshes[0], points, meshes[1], meshes[2])
 
 
-def _box(tube: Tube, station: float, left: float, up: float, size: tuple[float, float, float]) -> trimesh.Trimesh:
+def box(tube: Tube, station: float, left: float, up: float, size: tuple[float, ...]) -> trimesh.Trimesh:
+    """A box along the tube."""
     placement = np.eye(4)
     placement[:3, :3] = np.column_stack([axis[0] for axis in tube.frames(station)[1:]])
     placement[:3, 3] = tube.point(station, left, up)[0]
