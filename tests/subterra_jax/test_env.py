@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from subterra_jax.baselines.agent import observed
-from subterra_jax.baselines.registry import make_agent
 from subterra_jax.lidar import LidarParams
 from subterra_jax.lidar3d.echo import EchoParams
 from subterra_jax.lidar3d.space import Mount
@@ -123,23 +121,6 @@ def test_an_episode_is_what_it_was(task, request):
     told["starts"] = named(starts(jax.random.key(5)))
     told["space"] = {"low": space.low, "high": space.high, "images": env.images(params)}
     check(VALUES, f"episode {request.node.callspec.params['task']}", told, 3e-4)
-
-
-@pytest.mark.parametrize("task", ["Return"], indirect=True)
-@pytest.mark.parametrize("name", ["fused", "scan-matching", "Return-locate"])
-def test_an_agent_thinks_what_it_thought(task, name):
-    """Commands and memories of the baselines on one way, of which they do not choose the commands."""
-    env, params, reset, step = task
-    agent = st.load_policy(name, env, params).agent if name == "Return-locate" else make_agent(name, params)
-    said = []
-    act = jax.jit(lambda key, memory, flat: agent.act(key, memory, observed(env, params, flat), params, None))
-    obs, state = reset(jax.random.key(3), params)
-    memory = agent.begin(jax.random.key(4), observed(env, params, obs), params)
-    for k in range(12):
-        action, memory = act(jax.random.key(k), memory, obs)
-        said.append(action)
-        obs, state, *_ = step(jax.random.key(k), state, forward(env).at[1].set(0.1), params)
-    check(VALUES, name, {"said": np.stack(said), "memory": named(memory)}, 3e-4)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e30])
