@@ -10,47 +10,55 @@ import pytest
 
 import subterra_jax as st
 from subterra_jax.baselines.agent import observed
+from subterra_jax.baselines.registry import make_agent
 from subterra_jax.parts.obstacles import ObstacleParams
+from subterra_jax.policies import load
+from subterra_jax.policies.files import is_policy
 from subterra_jax.rules import GoalParams
 from tests.recorded import check
 
 TABLE = Path(__file__).with_name("thoughts.csv")
-NEAR = {"goal": GoalParams(low=20.0, high=30.0, margin=10.0)}
+NEAR = {"goal": GoalParams(low=18.0, high=19.0, margin=10.0)}
 WAYS = {  # length of the tunnel (m), task, and what is not its own
-    "Return": (351.0, "Return", {}),
+    "Return": (80.0, "Return", NEAR),
     "Stop": (80.0, "StopAtShort", NEAR),
     "Hidden": (80.0, "StopAt", {**NEAR, "hidden_start": True}),
     "Report": (200.0, "Relocalise", {}),
     "Faults": (80.0, "Faulted", {**NEAR, "obstacles": ObstacleParams()}),
 }
 AGENTS = (
-    *(("Return", name) for name in ("fused", "scan-matching", "Return-locate")),
-    *(("Stop", name) for name in ("histogram-filter", "locate-map", "locate-transformer")),
-    *(("Hidden", name) for name in ("ceiling", "particle-filter")),
-    *(("Report", name) for name in ("histogram-filter", "particle-filter")),
-    *(("Faults", name) for name in ("ceiling", "oracle", "random", "locate-obstructed")),
+    *(("Return", name, 200) for name in ("fused", "scan-matching", "Return-locate", "Return-v1")),
+    *(("Stop", name, 12) for name in ("histogram-filter", "StopAt-v1")),
+    *(("Hidden", name, 12) for name in ("ceiling", "particle-filter")),
+    ("Hidden", "locate-map", 150),
+    *(("Report", name, 12) for name in ("histogram-filter", "particle-filter")),
+    *(("Faults", name, 12) for name in ("ceiling", "oracle", "random", "locate-obstructed")),
 )
+TURN = range(120, 141)  # steps of half a turn
 
 
 @cache
-def way(name, n_steps):
+def way(name):
     """An environment, its params, and observations and truths of a way through a piece of the packaged tunnel."""
     length, task, options = WAYS[name]
     env, params = st.make(f"Subterra/{task}-v1", tunnel=st.load_tunnel().slice(0.0, length), **options)
     step = jax.jit(env.step)
     obs, state = jax.jit(env.reset)(jax.random.key(3), params)
     seen = []
-    for k in range(n_steps):
+    for k in range(max(n for task, _, n in AGENTS if task == name)):
         seen.append((obs, env.privileged(state, params)))
-        action = jnp.zeros(env.action_size).at[:2].set(jnp.array([2.0 - 0.05 * (k % 12), 0.1 * (-1) ** (k // 2)]))
-        obs, state, *_ = step(jax.random.key(k), state, action, params)
+        speed, rate = (0.2, 1.5) if name == "Return" and k in TURN else (2.0 - 0.05 * (k % 12), 0.1 * (-1) ** (k // 2))
+        obs, state, *_ = step(
+            jax.random.key(k), state, jnp.zeros(env.action_size).at[:2].set(jnp.array([speed, rate])), params
+        )
     return env, params, jax.tree.map(lambda *rows: jnp.stack(rows), *seen)
 
 
-@pytest.mark.parametrize(("task", "name"), AGENTS)
-def test_an_agent_thinks_what_it_thought(task, name):
-    env, params, (flat, truth) = way(task, 75 if "locate" in name else 12)
-    agent = st.load_policy(name, env, params).agent
+@pytest.mark.parametrize(("task", "name", "n"), AGENTS)
+def test_an_agent_thinks_what_it_thought(task, name, n):
+    env, params, seen = way(task)
+    flat, truth = jax.tree.map(lambda rows: rows[:n], seen)
+    agent = load(name)[0].with_map(params) if is_policy(name) else make_agent(name, params)
 
     @jax.jit
     def think(flat, truth, params):
@@ -66,4 +74,4 @@ def test_an_agent_thinks_what_it_thought(task, name):
     memory, said = think(flat, truth, params)
     leaves = jax.tree_util.tree_flatten_with_path(memory)[0]
     held = {jax.tree_util.keystr(path, simple=True, separator=" "): np.asarray(leaf, float) for path, leaf in leaves}
-    check(TABLE, f"{task} {name}", {"said": said, "memory": held}, 3e-4)
+    check(TABLE, f"{task} {name}", {"said": said, "memory": held}, 3e-4 if n < 100 else 2e-3)
