@@ -13,7 +13,7 @@ import pytest
 
 from tests.train.conftest import TASK, call
 from train import __main__ as navigate
-from train import devices, drives, learning, localiser, map_target
+from train import devices, learning, localiser, map_target
 from train.config import TrainConfig
 
 
@@ -123,16 +123,6 @@ def test_the_localiser_learns_ever_more_slowly_down_to_a_fiftieth(monkeypatch):
     np.testing.assert_allclose(moved, ALONG.localiser_rate * np.array([1.0, 0.51, 0.02]), rtol=1e-2)
 
 
-def test_what_the_map_tells_is_added_to_the_localisers_loss(monkeypatch):
-    learner = localiser.LocaliserLearner(None, ROVER, ALONG)
-    learner.map = "a strip"
-    monkeypatch.setattr(localiser, "estimate", lambda weights, drive, n_metres: (drive, drive, drive))
-    monkeypatch.setattr(localiser, "station_loss", lambda *_: (1.0, {}))
-    monkeypatch.setattr(localiser, "map_loss", lambda *_: (jnp.float32(5.0), {}))
-    total, _ = learner._loss(None, jnp.zeros(3), jnp.zeros(3), [10.0])
-    assert float(total) == pytest.approx(1.0 + 3 * 5.0 / 10.0)
-
-
 def test_a_wrong_map_is_of_a_place_at_least_50_m_away():
     tunnel = SimpleNamespace(count=1, length=jnp.float32(300.0))
     drive = SimpleNamespace(start=jnp.linspace(0.0, 250.0, 4000), tunnel=jnp.zeros(4000, jnp.int32))
@@ -142,13 +132,6 @@ def test_a_wrong_map_is_of_a_place_at_least_50_m_away():
     assert np.mean(np.asarray(given.sigma) > 0.0) == pytest.approx(0.5, abs=0.03)
     assert np.minimum(away, 300.0 - away)[wrong].min() > 49.99
     assert (away[~wrong] == 0.0).all()
-
-
-def test_drives_begin_where_there_is_room_for_all_their_way(monkeypatch):
-    monkeypatch.setattr(drives, "_starts", lambda env, params, keys, n, room: pytest.fail(f"{room:.0f}"))
-    with pytest.raises(pytest.fail.Exception) as asked:
-        drives.record_drives(SimpleNamespace(env=None), None, ROVER, jax.random.PRNGKey(0), 4, 100)
-    assert float(str(asked.value)) > 20.0 + 20.0  # at full speed, and on to the goal's far side
 
 
 TWO_DEVICES = """

@@ -50,19 +50,8 @@ def test_a_file_sets_what_the_command_line_sets_and_the_command_line_has_the_las
 
 @pytest.mark.parametrize("words", [(), ("--memory", "gru"), ("--memory", "along", "--auxiliary", "--map")])
 def test_the_settings_of_a_run_are_read_back_as_they_were(tmp_path, words):
-    given = [
-        "--task",
-        "Subterra/StopAtShort-v1",
-        *words,
-        "--n-envs=96",
-        "--reward.miss",
-        "3.5",
-        "--out",
-        "o",
-        "--log",
-        "json:dumps",
-    ]
-    command = read_command(given)
+    given = "--task Subterra/StopAtShort-v1 --n-envs=96 --reward.miss 3.5 --out o --log json:dumps"
+    command = read_command([*given.split(), *words])
     (tmp_path / "config.json").write_text(json.dumps({"schema": "subterra.run/1", "command": settings_of(command)}))
     again = read_command(["--config", str(tmp_path / "config.json"), "--out", "o"])
     assert settings_of(again) == settings_of(command)
@@ -73,18 +62,8 @@ def test_the_settings_of_a_run_are_read_back_as_they_were(tmp_path, words):
 @pytest.mark.slow
 def test_a_run_is_done_again_from_its_own_config(train_small, tmp_path):
     (tmp_path / "outcome.py").write_text("lines = []\ndef keep(line):\n    lines.append(line)\n")
-    few = (
-        "--steps=8192",
-        "--stop-coverage=2",
-        "--memory=stack",
-        "--frames",
-        "2",
-        "--reward.coverage",
-        "7",
-        "--evaluation-episodes",
-        "5",
-    )
-    status, first = train_small(*few, "--log", f"{tmp_path / 'outcome.py'}:keep")
+    few = "--steps=8192 --stop-coverage=2 --memory=stack --frames 2 --reward.coverage 7 --evaluation-episodes 5"
+    status, first = train_small(*few.split(), "--log", f"{tmp_path / 'outcome.py'}:keep")
     assert status == 0
     assert call(navigate.main, "--config", str(first / "config.json"), "--out", str(tmp_path / "again")) == 0
     assert log_without_timing(tmp_path / "again") == log_without_timing(first)
