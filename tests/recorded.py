@@ -10,6 +10,7 @@ from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 _FEW = 6
@@ -92,3 +93,9 @@ def _same(before: list[str], now: tuple[Any, ...], rel: float) -> bool:
 def arrays_of(model: Any) -> dict[str, np.ndarray]:
     """Arrays of a MuJoCo model that say what stands where, how heavy and how driven."""
     return {name: getattr(model, name) for name in _MODEL}
+
+
+def named(tree):
+    """Leaves of a tree by their paths."""
+    leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
+    return {jax.tree_util.keystr(path, simple=True, separator=" "): np.asarray(leaf, float) for path, leaf in leaves}

@@ -15,7 +15,7 @@ from subterra_jax.lidar3d.space import Mount
 from subterra_jax.parts import FaultParams, ImuParams, make_sensor
 from subterra_jax.parts.obstacles import ObstacleParams
 from subterra_jax.parts.unicycle import VehicleParams
-from tests.recorded import check
+from tests.recorded import check, named
 
 VALUES = Path(__file__).with_name("episodes.csv")
 INFO = {"coverage", "station", "lateral", "half_width", "clearance", "contact", "success"}
@@ -45,12 +45,6 @@ def task(request):
     id, overrides = COVERING[request.param]
     env, params = st.make(id, **overrides)
     return env, params, jax.jit(env.reset), jax.jit(env.step)
-
-
-def named(tree):
-    """Leaves of a tree by their paths."""
-    leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
-    return {jax.tree_util.keystr(path, simple=True, separator=" "): np.asarray(leaf, float) for path, leaf in leaves}
 
 
 def forward(env):

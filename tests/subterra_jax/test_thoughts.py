@@ -5,7 +5,6 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pytest
 
 import subterra_jax as st
@@ -15,7 +14,7 @@ from subterra_jax.parts.obstacles import ObstacleParams
 from subterra_jax.policies import load
 from subterra_jax.policies.files import is_policy
 from subterra_jax.rules import GoalParams
-from tests.recorded import check
+from tests.recorded import check, named
 
 TABLE = Path(__file__).with_name("thoughts.csv")
 NEAR = {"goal": GoalParams(low=18.0, high=19.0, margin=10.0)}
@@ -73,6 +72,4 @@ def test_an_agent_thinks_what_it_thought(task, name, n):
         return jax.lax.scan(act, agent.begin(keys[0], observed(env, params, flat[0]), params), (keys, flat, truth))
 
     memory, said = think(flat, truth, params)
-    leaves = jax.tree_util.tree_flatten_with_path(memory)[0]
-    held = {jax.tree_util.keystr(path, simple=True, separator=" "): np.asarray(leaf, float) for path, leaf in leaves}
-    check(TABLE, f"{task} {name}", {"said": said, "memory": held}, 3e-4 if n == 12 else 2e-3)
+    check(TABLE, f"{task} {name}", {"said": said, "memory": named(memory)}, 3e-4 if n == 12 else 2e-3)
