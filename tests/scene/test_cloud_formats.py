@@ -92,18 +92,6 @@ def test_only_an_e57_needs_the_library_that_reads_it(tmp_path, monkeypatch):
         points_of(path)
 
 
-@pytest.mark.parametrize(
-    ("delimiter", "header", "comma"),
-    [(" ", "", False), ("\t", "//X Y Z".replace(" ", "\t"), False), (";", "Easting;Northing;Height", True),
-     (",", "# exported", False), (",", "", False)],
-)  # fmt: skip
-def test_delimiter_header_and_decimal_comma_are_detected(tmp_path, delimiter, header, comma):
-    path = write_text(tmp_path / "a.txt", POINTS, delimiter, header)
-    if comma:
-        path.write_text(path.read_text().replace(".", ","))
-    np.testing.assert_allclose(points_of(path)[0], ordered(POINTS), atol=2e-6)
-
-
 def test_a_flag_comes_before_a_declaration_and_a_declaration_before_detection(tmp_path):
     path = write_text(tmp_path / "a.csv", POINTS, ",", "x (mm),y (mm),z (mm)")
     assert points_of(path)[1]["unit"] == "mm (declared)"

@@ -5,8 +5,8 @@ import pytest
 
 from scene.bore import Bore
 from scene.cloud import Cloud
-from scene.errors import Cause, Code, FitError
-from scene.judging.judge import Judgement, JudgingConfig, judge_bore, require_trust
+from scene.errors import Cause, Code
+from scene.judging.judge import Judgement, JudgingConfig, judge_bore
 from scene.judging.places import BEHIND, BEYOND, EXPLAINED, INSIDE, TrackZone, compare_returns, wall_radius
 
 FLOOR = -3.2
@@ -143,16 +143,6 @@ def test_strays_do_not_count_as_having_seen_a_wall(bore):
     judgement = judged_without(bore, lambda station, *_: (station > 8) & (station < 18) & ~few)
     assert judgement.coverage.patches[0].sides == "all around"
     assert judgement.coverage.fraction == pytest.approx(14 / 24, abs=0.08)
-
-
-def test_a_bore_that_explains_too_little_is_refused_unless_forced(bore, wall):
-    raised = about(bore, *on_wall(bore, 60_000, outward=-0.5, seed=3))
-    judgement = judge_bore(bore, cloud_of(wall, raised), JudgingConfig())
-    with pytest.raises(FitError) as refused:
-        require_trust(judgement, force=False)
-    assert refused.value.code is Code.UNEXPLAINED
-    require_trust(judgement, force=True)
-    require_trust(judge_bore(bore, cloud_of(wall, raised), JudgingConfig(refuse_above=0.6)), force=False)
 
 
 def test_what_was_cut_away_as_another_tunnel_refuses_nothing(bore, wall):

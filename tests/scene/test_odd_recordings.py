@@ -78,26 +78,6 @@ def test_a_livox_message_that_promises_more_points_than_it_holds_is_named(tmp_pa
     assert "scan 0 of /livox/lidar is not a whole CustomMsg" in outcome(bag)
 
 
-CONTROL = {
-    "empty": (np.empty((0, 4)), "control needs 10 rows"),
-    "one time": (np.tile([5.0, 1, 2, 3], (40, 1)), "control needs 10 rows at different times, found 1"),
-    "NaN": (np.column_stack([np.arange(40.0), np.full((40, 3), np.nan)]), "row 1 is not finite"),
-    "five numbers": (np.ones((40, 5)), "control has rows of 4 or 8 numbers"),
-    "in one place": (np.column_stack([np.arange(40.0), np.ones((40, 3))]), "all positions lie within 0.00 m"),
-    "milliseconds": (
-        np.column_stack([5000 + 100 * np.arange(40.0)] + [np.arange(40.0)] * 3),
-        "are 4995 s apart",
-    ),
-}
-
-
-@pytest.mark.parametrize("name", CONTROL)
-def test_odd_control_ends_in_one_sentence(tmp_path, name):
-    rows, said = CONTROL[name]
-    bag = clouds(tmp_path / "a.bag", 5 + 0.1 * np.arange(40))
-    assert said in outcome(bag, write_tum(tmp_path / "prism.tum", rows))
-
-
 def test_control_without_an_imu_says_what_is_missing(tmp_path):
     bag = clouds(tmp_path / "a.bag", 5 + 0.1 * np.arange(40))
     rows = np.column_stack([5 + 0.1 * np.arange(40.0)] + [np.arange(40.0)] * 3)

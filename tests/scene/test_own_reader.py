@@ -14,7 +14,7 @@ import trimesh
 from scene.build import build
 from scene.errors import RecordingError
 from scene.reading import RawScan, ScanSource, formats, make_scan, register_reader
-from scene.reading.formats import detect
+from scene.reading.formats import detect, load_reader
 from scene.reading.recording import Recording
 from subterra_jax.host.loading import UserCodeError, load_module
 from tests.scene.bags import write_tum
@@ -50,7 +50,7 @@ def write_zip(path: Path, scans: list[np.ndarray]) -> Path:
 
 def test_a_zip_of_ply_scans_is_read_by_a_file_outside_the_package(reader, tmp_path):
     points = np.random.default_rng(0).uniform(1, 9, (3, 30, 3)).astype(np.float32)
-    load_module(str(reader))
+    load_reader(str(reader))
     with Recording(write_zip(tmp_path / "walk.zip", points)) as recording:
         scans = list(recording.scans())
         facts = recording.peek()

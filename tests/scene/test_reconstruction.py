@@ -9,13 +9,13 @@ from scene.bore import Bore
 from scene.cleaning.sort import list_removed, sort_points
 from scene.cleaning.tube import Tube, bridge_hanging
 from scene.cloud import Cloud
-from scene.errors import Cause, FitError
+from scene.errors import Cause
 from scene.fitting.axis import section_middles
-from scene.fitting.section import fit_sections, visible_span
+from scene.fitting.section import visible_span
 from scene.fitting.unroll import Grid
 from scene.geometry import Around, axis_through
 from tests.scene.clouds import KnownBore, curved_d_bore
-from tests.scene.fits import axis_of, cleaned, rebuilt, thin
+from tests.scene.fits import cleaned, rebuilt, thin
 from tests.scene.shapes import PLACE, midline, outline, swept
 
 STRAIGHT = np.array([[0.0] * 3, [30.0, 0.0, 0.0]])
@@ -52,21 +52,6 @@ def test_a_hole_in_the_survey_is_filled_and_marked():
     at_hole = np.abs(bore.position[:, 0] + np.floor(np.median(known.points[:, 0])) - 15) < 0.2
     assert bore.filled[at_hole].all()
     assert np.abs(bore.width[at_hole] - known.width).max() < 0.05
-
-
-@pytest.mark.parametrize("shape", ["plane", "ball", "noise"])
-def test_a_cloud_without_a_tunnel_is_refused(shape):
-    rng = np.random.default_rng(0)
-    if shape == "plane":
-        points = np.column_stack([rng.uniform(0, 60, 60000), rng.uniform(0, 8, 60000), rng.normal(0, 0.01, 60000)])
-    elif shape == "ball":
-        points = rng.normal(size=(60000, 3))
-        points *= 8 / np.linalg.norm(points, axis=1, keepdims=True)
-    else:
-        points = rng.uniform(-10, 10, (60000, 3))
-    cloud = thin(points)
-    with pytest.raises(FitError):
-        fit_sections(cloud, axis_of(cloud))
 
 
 def test_curvature_and_grade_are_in_the_bore_file(tmp_path):

@@ -3,10 +3,16 @@
 import numpy as np
 import pytest
 
+from scene.build import judge, reconstruct
+from scene.cleaning.clean import ExtentConfig
+from scene.config import ReconstructConfig
 from scene.errors import FitError, RecordingError, Refusal
 from scene.fitting.rings import bore_from_rings, fit_rings
+from scene.judging.judge import JudgingConfig
+from scene.progress import Stages
 from scene.reading.formats import detect
 from scene.reading.ringsurvey import read_ring_survey
+from scene.writing.track import TrackConfig, lay_track
 from tests.scene.files import RING_HEADER, ring_rows, write_xlsx
 from tests.shared import METRO, SHARED, needs_metro
 
@@ -34,6 +40,20 @@ def test_circles_are_recovered(tmp_path):
     np.testing.assert_allclose(bore.ring_station, 1.5 * np.arange(12), atol=1e-3)
     assert not bore.filled[::6].any()  # stations of rings, 0.25 m apart from the next
     assert bore.filled[3::6].all()
+
+
+@pytest.mark.parametrize("reverse", [False, True])
+def test_a_ring_survey_is_a_round_bore_from_its_first_ring_to_its_last_or_back(tmp_path, reverse, capsys):
+    (tmp_path / "s.csv").write_text(survey_text())
+    result = reconstruct(tmp_path, None, ReconstructConfig(extent=ExtentConfig(reverse=reverse)), Stages())
+    ends = np.array([[1000.0, 500, 10], [1016.5, 500, 10]])[:: -1 if reverse else 1]
+    np.testing.assert_allclose(result.bore.position[[0, -1]] + result.origin, ends, atol=1e-3)
+    facts = result.facts
+    assert (facts["rings"], facts["first_ring"], facts["last_ring"]) == (12, *(("11", "0") if reverse else ("0", "11")))
+    assert (facts["radius_mean"], facts["radius_sd"]) == pytest.approx((2.9, 0.0), abs=1e-4)
+    assert facts["stations_grow"].startswith("against this, by --reverse" if reverse else "with the order of the rings")
+    assert "detected: " in capsys.readouterr().out
+    assert "holds no returns" in judge(result, lay_track(result.bore, TrackConfig()), JudgingConfig()).summary()
 
 
 def test_a_ring_is_seen_as_far_as_its_points_reach_and_an_eighth_of_a_turn_more(tmp_path):

@@ -1,8 +1,6 @@
-"""Trajectories from control, odometry and IMU: term by term, and on a whole survey by the user's own commands."""
+"""Trajectories from control, odometry and IMU: term by term, and on a whole recording."""
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,11 +11,19 @@ from scipy.spatial.transform import Rotation
 
 from scene.errors import FitError, Refusal
 from scene.poses import imu
+from scene.poses.calibration import load_calibration
 from scene.poses.imu import GRAVITY, Inertial, integrals
+from scene.poses.locate import check_located, locate_by_control, locate_by_odometry
 from scene.poses.smoother import Noise, find_control_lag, inertial_problem, means_between, solve_with_heading
 from scene.poses.terms import KNOT_SIZE, Chain, Motion, NormalEquations, Sightings, Steps, add_biases, add_motion
-from scene.poses.trajectory import Control
+from scene.poses.trajectory import Control, load_control
+from scene.progress import Stages
+from scene.reading.recording import Recording
+from tests.recorded import check
 from tests.scene import walks
+from tests.scene.surveyed import load_trajectory, survey
+
+TABLE = Path(__file__).with_name("values.csv")
 
 DURATION = 24.0
 
@@ -153,41 +159,42 @@ def test_the_imu_in_the_housing_of_a_lidar_levels_it(monkeypatch):
     np.testing.assert_allclose(turn.apply(own.force[0])[:2], 0.0, atol=1e-9)
 
 
-ROOT = Path(__file__).parents[2]
+@pytest.fixture(scope="module", params=[0.0, 0.3])
+def recorded(request, tmp_path_factory):
+    """How late the IMU's clock is, s, a walk through a bore, its folder, and its true poses."""
+    words = ("--length", 10.5, "--seed", 4, "--point-rate", 24000, "--speed", 3, "--imu-late", request.param)
+    folder = survey(tmp_path_factory.mktemp("walk"), *words)
+    with Recording(folder / "survey.bag") as bag:
+        yield request.param, bag, folder, load_trajectory(folder / "groundtruth.tum")
 
 
-def run(*arguments: object) -> None:
-    done = subprocess.run([sys.executable, "-m", *map(str, arguments)], cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+def test_a_prism_fixes_poses_to_millimetres_once_the_clock_of_the_imu_is_set_right(recorded):
+    late, bag, folder, truth = recorded
+    mounts, control = load_calibration(folder / "calibration.yaml"), load_control(folder / "prism.tum")
+    found = check_located(bag, locate_by_control(bag, control, mounts, Stages(), auto=True))
+    facts, poses = found.facts, found.trajectory
+    assert facts["clock_offset"] == pytest.approx(late, abs=0.003)
+    assert facts["clock_corrected"] == (late > 0.0)
+    position, attitude = truth.at(poses.times)
+    off, twist = poses.positions - position, np.rad2deg((attitude.inv() * poses.rotations).magnitude())
+    assert np.abs(off).max() < 0.006
+    assert twist.max() < 0.6
+    assert (facts["control_outliers"], facts["pose_doubt"], facts["clock_doubt"]) == (0, None, None)
+    assert facts["control_residual_rms"] == pytest.approx(0.0025, abs=0.001)
+    assert facts["length_uncertainty"] == pytest.approx(np.sqrt(2) * np.hypot(2 * 0.003, 0.05))  # 95 %: control, ends
+    if not late:
+        check(TABLE, "control", {"off": off, "twist": twist, "facts": facts | {"clock_offset": late}}, 0.02)
 
 
-@pytest.fixture(scope="module")
-def survey(tmp_path_factory):
-    out = tmp_path_factory.mktemp("survey")
-    run("scene.survey", "--length", 30, "--seed", 77, "--out", out)
-    return out
-
-
-@pytest.mark.slow
-def test_prism_control_gives_the_bore_in_the_surveys_own_frame(survey, tmp_path):
-    from benchmarks.truth import compare, load_truth
-
-    bag, prism = survey / "survey.bag", survey / "prism.tum"
-    run("scene.build", bag, "--control", prism, "--calibration", "geode-gamma", "--out", tmp_path / "scene")
-    comparison = compare(tmp_path / "scene", load_truth(survey / "truth.json"))
-    assert abs(comparison.length_error) < 0.002 * 30 + 0.01
-    assert np.sqrt(np.mean(comparison.lateral**2)) < 0.05
-    assert np.sqrt(np.mean(comparison.width**2)) < 0.04
-    assert np.sqrt(np.mean(comparison.height**2)) < 0.04
-    found = json.loads((tmp_path / "scene" / "manifest.json").read_text())["detected"]
-    assert found["length_fixed_by"] == "control"
-    assert found["imu"] == "/livox/imu"
-    assert abs(comparison.length_error) < found["length_uncertainty"] < 0.2
-
-
-@pytest.mark.slow
-def test_odometry_alone_says_that_nobody_measured_the_length(survey, tmp_path):
-    run("scene.build", survey / "survey.bag", "--out", tmp_path / "scene")
-    found = json.loads((tmp_path / "scene" / "manifest.json").read_text())["detected"]
-    assert "nothing measured the axial scale" in found["length_fixed_by"]
-    assert found["length_uncertainty"] is None
+def test_odometry_is_level_and_says_that_nobody_measured_the_length(recorded):
+    late, bag, folder, truth = recorded
+    found = locate_by_odometry(bag, load_calibration(folder / "calibration.yaml"), Stages(), auto=True)
+    assert "nothing measured the axial scale" in found.facts["length_fixed_by"]
+    assert found.facts["length_uncertainty"] is None
+    attitude = truth.at(found.trajectory.times)[1]
+    turned = attitude * found.trajectory.rotations.inv()  # from its own frame to the survey's
+    assert turned.apply([0.0, 0.0, 1.0])[:, 2].min() > np.cos(np.deg2rad(2.0))
+    assert np.rad2deg((turned * turned[0].inv()).magnitude()).max() < 2.0
+    if not late:
+        twist = (turned * turned[0].inv()).as_rotvec()
+        check(TABLE, "odometry", {"twist": twist, "path": found.trajectory.positions}, 0.02)

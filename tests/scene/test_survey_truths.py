@@ -81,17 +81,6 @@ def test_sizes_are_those_of_the_class(bare: tuple[Path, dict, Cast]) -> None:
         assert not truth["pockets"] + truth["rings"]["station"]
 
 
-def test_the_same_seed_gives_the_same_bytes_and_another_does_not(tmp_path: Path) -> None:
-    one, same, other = (
-        make(tmp_path / n, "--truth", "irregular", "--seed", s) for n, s in (("a", 1), ("b", 1), ("c", 2))
-    )
-    names = sorted(p.name for p in one.iterdir())
-    assert names == ["prism.tum", "truth.json", "truth.ply"]
-    for name in names:
-        assert (one / name).read_bytes() == (same / name).read_bytes()
-        assert (one / name).read_bytes() != (other / name).read_bytes()
-
-
 @pytest.mark.parametrize("correlation", [1.0, 4.0])
 def test_irregular_walls_have_the_spread_and_correlation_asked_for(correlation: float) -> None:
     station, girth = np.arange(0.0, 400.0, 1.0), np.arange(0.0, 12.0, 0.5)

@@ -206,6 +206,7 @@ CLOUD_FILES: dict[str, tuple[str, str | bytes]] = {
         f"{k},{','.join(row)}\n" for k, row in enumerate(ROWS))),
     "lines of Windows": ("a.xyz", ENGLISH.replace("\n", "\r\n")),
     "a mark before the text": ("a.xyz", b"\xef\xbb\xbf" + ENGLISH.encode()),
+    "a comment first": ("a.csv", "# exported\n" + ENGLISH.replace(" ", ",")),
     "exponents": ("a.xyz", "".join(f"{x:.9e} {y:.9e} {z:.9e}\n" for x, y, z in XYZ)),
     "a PTS of three scans": ("a.pts", pts(3)),
     "a PTS without its count": ("a.pts", pts(1).partition("\n")[2]),
