@@ -114,6 +114,7 @@ def test_an_episode_is_what_it_was(task, request):
     starts = jax.jit(lambda key: jax.vmap(env.begin, (0, None))(env.draw_reset(key, (32,), params), params))
     told["starts"] = named(starts(jax.random.key(5)))
     told["space"] = {"low": space.low, "high": space.high, "images": env.images(params)}
+    told["space"]["drawn"] = jax.vmap(space.sample)(jax.random.split(jax.random.key(0), 7))
     check(VALUES, f"episode {request.node.callspec.params['task']}", told, 3e-4)
 
 

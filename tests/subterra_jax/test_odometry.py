@@ -95,12 +95,13 @@ def test_a_constant_command_is_followed_along_its_exact_arc(command):
     assert float(heading) == pytest.approx(0.5 + w, abs=1e-5)
 
 
-def test_headings_stay_within_half_a_turn():
+@pytest.mark.parametrize("rate", [1.5, -1.5])
+def test_headings_stay_within_half_a_turn(rate):
     heading = jnp.float32(0.0)
     for _ in range(100):
-        _, heading = vehicle.follow_arc(jnp.zeros(2), heading, jnp.array([0.0, 1.5]), VEHICLE.period)
+        _, heading = vehicle.follow_arc(jnp.zeros(2), heading, jnp.array([0.0, rate]), VEHICLE.period)
         assert abs(float(heading)) <= np.float32(np.pi)
-    assert float(heading) == pytest.approx((15.0 + np.pi) % (2 * np.pi) - np.pi, abs=1e-4)
+    assert float(heading) == pytest.approx((10.0 * rate + np.pi) % (2 * np.pi) - np.pi, abs=1e-4)
 
 
 @pytest.mark.parametrize(

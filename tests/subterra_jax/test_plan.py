@@ -48,7 +48,7 @@ def arrays():
         ("left_smooth", lambda a: a[:1]),
         ("right_pockets", lambda a: a[:, :1]),
         ("right_smooth", lambda a: np.add(a, [0.0, 6.0])),
-        ("right_station_smooth", lambda a: a[::-1]),
+        ("right_station_smooth", lambda a: a[[1, 0, *range(2, len(a))]]),
         ("left_station_pockets", lambda a: a[1:]),
         ("furniture_pockets", lambda a: np.zeros((3, 3))),
         ("left_pockets", lambda a: a.astype(str)),

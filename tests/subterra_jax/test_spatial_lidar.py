@@ -220,6 +220,7 @@ def test_what_is_nearer_than_the_least_range_is_no_return(graded):
     """Beams to the left wall, 2.8 m away, and ahead and up, further away; the least range lies between."""
     beam = np.array([[0.0, 1.0, 0.0], [0.0, np.cos(1.2), np.sin(1.2)]])
     env, params = st.make(TASK, tunnel=graded, sensor=exact(beam, range_min=2.9))
+    env, params = st.make(TASK, tunnel=params.tunnel, sensor=params.lidar)  # a ready tunnel with its heights will do
     left, above = observe(env, placed(env, params, 15.0, 0.0, 0.0), params)["scan"]
     assert left == 30.0
     assert 2.9 < above < 30.0

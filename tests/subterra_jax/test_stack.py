@@ -1,5 +1,6 @@
 """Several tunnels in one: each behaves as it does alone, whichever others are beside it."""
 
+import dataclasses
 from functools import partial
 
 import jax
@@ -116,6 +117,7 @@ def test_a_stack_of_one_is_that_one_and_picks_itself(alone):
     assert stack(alone[:1]) is alone[0]
     assert alone[0].pick(0) is alone[0]
     assert (alone[0].count, stack(alone[:2]).count) == (1, 2)
+    assert stack([alone[0], dataclasses.replace(alone[1], packed=None)]).packed is None  # XLA casts there
 
 
 def test_an_empty_stack_and_a_stack_of_stacks_are_refused(alone, together):
