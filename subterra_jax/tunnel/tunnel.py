@@ -144,10 +144,9 @@ class Tunnel:
         box = np.column_stack(
             [blocks.centre, blocks.half, blocks.thickness, half_length, visits.normal, visits.ahead, visits.behind]
         ).T.astype(np.float32)
-        # A slice beyond the end would start earlier than asked for.
-        around = 2 * GROUP, max(2 * GROUP, int(scan_first.max()) + n_scan - len(blocks.centre))
-        box = np.concatenate([_padding(around[0]), box, _padding(around[1])], axis=1)
-        wall = np.pad(blocks.offset.swapaxes(1, 2).astype(np.float32), (around, (0, 0), (0, 0)))
+        around = 2 * GROUP  # blocks of padding at either end; no window reaches beyond the last block
+        box = np.concatenate([_padding(around), box, _padding(around)], axis=1)
+        wall = np.pad(blocks.offset.swapaxes(1, 2).astype(np.float32), ((around, around), (0, 0), (0, 0)))
         wall = np.pad(wall, ((0, 0), (0, 0), (0, (1 - wall.shape[2]) % WIDTH)), mode="edge")
         count = np.pad(blocks.count, around, constant_values=1)
         real, whole = partial(_on_device, dtype=np.float32), partial(_on_device, dtype=np.int32)
@@ -159,9 +158,9 @@ class Tunnel:
             n_nodes=whole(len(plan.station)),
             texture=whole(-1 if plan.texture is None else plan.texture),
             grid=real(grid),
-            scan_first=whole(scan_first + around[0]),
-            contact_first=whole(contact_first + around[0]),
-            visit_first=whole(visits.start + around[0]),
+            scan_first=whole(scan_first + around),
+            contact_first=whole(contact_first + around),
+            visit_first=whole(visits.start + around),
             box=real(box),
             wall=real(wall),
             reach=reach,

@@ -191,6 +191,15 @@ def test_scans_of_one_place_meet_what_rays_of_a_place_each_meet(reliefs):
         np.testing.assert_allclose(np.ravel(one), other, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.parametrize(("image", "tall"), [((4, 8), 4), ((16, 256), 16), ((64, 512), 4), ((3, 64), 1)])
+def test_programs_take_each_ray_of_two_images_once_tile_by_tile(image, tall):
+    rays = np.asarray(jax.vmap(partial(fused._rays_of, image))(np.arange(2 * image[0] * image[1] // 32)))
+    assert np.array_equal(np.sort(rays, axis=None), np.arange(2 * image[0] * image[1]))
+    row, column = np.divmod(rays, image[1])
+    assert (np.ptp(row, axis=1) == tall - 1).all()
+    assert (np.ptp(column, axis=1) == 32 // tall - 1).all()
+
+
 def test_the_kernel_for_scans_lowers_for_a_gpu_and_serves_a_batch(reliefs, monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(kernels, "on_nvidia", lambda: True)

@@ -114,6 +114,7 @@ def upright():
 BORES = {
     "furnished": lambda: (st.load_tunnel("metro").slice(100.0, 9.0), "furnished"),
     "rough": lambda: (open_world.plan("open:rock:test-unseen:49", variants=("built",), length=7.0), "built"),
+    "even": lambda: (open_world.plan("open:cast:train:73", variants=("smooth",), length=5.0), "smooth"),
     "upright": lambda: (upright(), "built"),
 }
 
