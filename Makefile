@@ -7,7 +7,7 @@ DEMO   := $(VENV)/.installed-demo
 INSTALL = $(BIN)/pip install --quiet --disable-pip-version-check --constraint .ci/constraints.txt --editable
 export XLA_PYTHON_CLIENT_PREALLOCATE ?= false
 
-.PHONY: demo test test-slow doors reproduce arena figures docs lint setup tunnels clean help
+.PHONY: demo test test-slow doors reproduce arena docs lint setup tunnels clean help
 
 help:            ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## */\t/' | expand -t 16

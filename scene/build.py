@@ -281,7 +281,7 @@ def command(
             PTX, PTS, XYZ, CSV) or a ring survey (CSV, XLSX).
         more: Further bags of the same recording.
         out: Folder to write; replaced only once the new scene is complete.
-        trajectory: Poses of the LiDAR in TUM form, for a bag; without it, LiDAR odometry.
+        trajectory: Poses of the LiDAR in TUM or EuRoC form, for a bag; without it, LiDAR odometry.
         control: Positions of a prism in TUM form that fix odometry's length.
         calibration: Mounts of prism and IMU: geode-gamma, a YAML file, or the prism's x,y,z, m.
         reader: Python file or module of your own that registers a reader.

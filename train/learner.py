@@ -32,7 +32,7 @@ class Student:
 
 @struct.dataclass
 class Batch:
-    """What is learnt from: a rollout of some environments with advantages and value targets."""
+    """Experience to learn from: a rollout of some environments with advantages and value targets."""
 
     memory: Float[Array, "env cell"]  # memory of the network at the first step
     rollout: Rollout  # as stored

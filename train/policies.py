@@ -45,7 +45,7 @@ def make_agent(driver: Driver, policy: Policy, name: str = KIND, conditions: Con
     Args:
         driver: What drove in training.
         policy: The policy.
-        name: Name on the leaderboard.
+        name: Name on the board.
         conditions: Conditions of its training; None: any.
     """
     return released.from_tensors(KIND, driver.layout.to_json(), driver.tensors(policy), name, conditions)

@@ -154,6 +154,7 @@ def run_faults(config: FaultsConfig) -> None:
     Example: python -m benchmarks.fidelity faults --places 6 --scene build/tunnel --truth build/survey
     """
     require_folder(config.out)
+    load_outside(config)
     runner.check_ladder(config.kinds, config.places, config.draw)
     case = read_case(complete_inputs(config))
     if not case.has("reference"):
@@ -165,7 +166,8 @@ def run_faults(config: FaultsConfig) -> None:
     table = runner.sum_up(rows)
     write_csv(config.out / "ladder.csv", tuple(table[0]), table)
     for one in table:
-        factor, unit = (1000.0, "mm") if one["kind"] == "gauge" else (100.0, "cm")
+        factor, unit = {"m": (100.0, "cm")}.get(one["unit"], (1.0, one["unit"]))
+        factor, unit = (1000.0, "mm") if one["kind"] == "gauge" else (factor, unit)
         print(f"  {one['kind']} over {one['length']:g} m: {factor * one['size_95']:.2g} {unit}; "
               f"{factor * one['asked']:g} {unit} noticed at {one['noticed_at_asked']} of {one['places']}")  # fmt: skip
 

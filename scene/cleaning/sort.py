@@ -181,7 +181,7 @@ def name_bodies(
 
 
 _ROOT = 20  # percent of a branch's points, those nearest the bore, that are its mouth
-_BRANCH = 3.0  # m behind the wall: less is a niche
+_BRANCH = 3.0  # m behind the wall: less is a niche; more a gallery, a room, or the shaft of a manhole
 _BUILDING = 2000  # points
 
 
@@ -213,7 +213,7 @@ class Removed:
         if self.cause == Cause.BRANCH and self.deepest > _BRANCH:
             return (
                 f"{where} the bore opens into a branch or a room that reaches {self.deepest:.0f} m behind its wall; "
-                "it was cut at its mouth: build it from a cloud of its own"
+                "it was cut at its mouth: a tunnel there needs a cloud of its own"
             )
         if self.cause == Cause.ELSEWHERE and self.points > _BUILDING:
             return f"{where} another tunnel or building stands {self.nearest:.0f} m behind the wall; it was left out"

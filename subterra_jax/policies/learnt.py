@@ -85,7 +85,7 @@ class Learnt(Trained):
     map: MapStrip | HistogramLocaliser | None = None
     hides_map: bool = struct.field(pytree_node=False, default=False)
     blind: bool = struct.field(pytree_node=False, default=False)
-    name: str = struct.field(pytree_node=False, default=KIND)  # name on the leaderboard
+    name: str = struct.field(pytree_node=False, default=KIND)  # name on the board
     # conditions of its training; None: any
     conditions: Conditions | None = struct.field(pytree_node=False, default=None)
 

@@ -47,7 +47,7 @@ def from_tensors(
         kind: One of `KINDS`.
         layout: `action_low`, `action_high`, and what `Layout.to_json` or the localiser's class says.
         tensors: By name, as the agent's class says.
-        name: Name on the leaderboard.
+        name: Name on the board.
         conditions: Conditions of its training, which `check_fits` compares; None: any.
 
     Raises:

@@ -1,4 +1,4 @@
-"""From whatever names a driver to the agent that drives a task: for leaderboard, recorder, viewer and `load_policy`."""
+"""From whatever names a driver to the agent that drives a task: for board, recorder, viewer and `load_policy`."""
 
 import inspect
 from pathlib import Path

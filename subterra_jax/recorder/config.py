@@ -32,10 +32,10 @@ class RecorderConfig:
     Attributes:
         out: Folder to make; `recording/` and `truth/` go into it.
         task: Task id, as `Subterra/StopAt-v1` or `StopAt`.
-        agent: Driver, as on the leaderboard: a baseline, `policy:NAME`, `policy:FILE`, `policy:RUN-FOLDER`,
+        agent: Driver, as on the board: a baseline, `policy:NAME`, `policy:FILE`, `policy:RUN-FOLDER`,
             `module:Class` or `FILE.py:Class`.
         seed: Seed of everything random in the episode.
-        episode: Record this one of the task's 500 listed episodes instead (from 0), as the leaderboard drives it.
+        episode: Record this one of the task's 500 listed episodes instead (from 0), as the board drives it.
         tunnel: Tunnel file or name; the first of those that the task has by itself if left out.
         scene: Scene folder of `scene.build` in its place, whose tunnel is driven; a rover drives on its ground.
         lining: Variant of the walls; `pockets` if left out.

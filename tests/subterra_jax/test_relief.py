@@ -120,7 +120,7 @@ BORES = {
 
 
 def told(space):
-    """What the space of a tunnel holds, its words taken apart."""
+    """Contents of a tunnel's space, its words taken apart."""
     one, (frame, link, cell, entry, vertex) = space.relief, (np.asarray(getattr(space.relief, n)) for n in ARRAYS[:-1])
     code, half = np.sort(entry.view(np.uint32)).astype(int), np.ascontiguousarray(cell).view(np.uint16).reshape(-1, 4)
     return {

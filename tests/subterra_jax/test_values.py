@@ -80,7 +80,7 @@ ON_DEVICE = {
 
 
 def on_device(tunnel):
-    """What a tunnel on the device holds; its padding by its place alone."""
+    """Arrays of a tunnel on the device; its padding by its place alone."""
     box = np.asarray(tunnel.box)
     there = box[4] > 0.0
     halves = np.ascontiguousarray(tunnel.packed.block).view(np.uint16).reshape(-1, 16)[there]

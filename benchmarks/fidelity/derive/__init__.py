@@ -1,1 +1,1 @@
-"""What several categories compute from a case: casts, grids, distances; each once a case or once a reference."""
+"""Quantities of a case that several categories need: casts, grids, distances; each once a case or once a reference."""

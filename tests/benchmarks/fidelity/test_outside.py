@@ -101,9 +101,8 @@ def test_metrics_are_scored_beside_the_suite_and_leave_it_alone(tmp_path: Path) 
     assert base.categories["LIN"] == pytest.approx((100.0 * len(scored) + 50.0) / (len(scored) + 1))
     assert judged.scored["base"].categories["LIN"] == 100.0
     assert len(calls) == 3  # reconstruction, null tube, truth
-    assert outside.metrics()["lin_given"].number == 200
-    assert len(table.load_all()) == 203
-    assert len(table.load()) == 199
+    assert outside.metrics()["lin_given"].number == len(table.load()) + 1
+    assert len(table.load_all()) == len(table.load()) + 4
 
 
 DENT = """
@@ -113,7 +112,7 @@ def dent(site, fault):
 """
 
 
-def test_a_fault_of_a_file_is_a_control_and_a_ladder_beside_the_suite(tmp_path: Path) -> None:
+def test_a_fault_of_a_file_is_a_control_and_a_ladder_beside_the_suite(tmp_path: Path, monkeypatch, capsys) -> None:
     file = tmp_path / "mine.py"
     file.write_text(HEAD + DENT)
     digest = judge.constants_digest()
@@ -135,14 +134,19 @@ def test_a_fault_of_a_file_is_a_control_and_a_ladder_beside_the_suite(tmp_path: 
     assert judge.undetected([row | {"detected": False} for row in rows]) == []
     outside.clear()
     assert list_jobs(("dent",)) == []
+    monkeypatch.setattr(
+        sys, "argv", ["fidelity", "faults", "--kinds", "dent", "--metrics", str(file), "--scene", "none"]
+    )
+    assert main() == 2
+    assert "none" in capsys.readouterr().err  # and not that the kind is unknown
 
 
 def test_there_are_18_categories_and_199_metrics_with_unique_ids() -> None:
     rows = list(table.load().values())
     assert len(table.CATEGORIES) == 18
     assert len(rows) == 199
-    assert [row.number for row in rows] == list(range(1, 200))
-    assert len({row.id for row in rows}) == 199
+    assert [row.number for row in rows] == list(range(1, len(rows) + 1))
+    assert len({row.id for row in rows}) == len(rows)
 
 
 def test_nothing_that_is_true_by_construction_is_scored() -> None:

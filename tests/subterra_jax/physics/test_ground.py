@@ -101,7 +101,7 @@ def test_the_anchor_follows_the_robot_and_places_add_up_to_a_tenth_of_a_millimet
 
 @pytest.fixture(scope="module")
 def gaps(floor, railway):
-    """How far a ball of 5 cm, or the rover's wheel, is from the nearest two things, and in which directions, m."""
+    """Distances, m, of a ball of 5 cm, or the rover's wheel, from the nearest two things, and their directions."""
     tunnel = Tunnel.from_plan(floor)
     stack = join_tracks([read_track(floor), read_track(railway)])
 
