@@ -160,14 +160,13 @@ def run_faults(config: FaultsConfig) -> None:
     if not case.has("reference"):
         raise FidelityError("faults need a reference: give --recording with --trajectory, or --truth")
     rows = runner.climb_ladders(case, config.kinds, config.places, config.draw, config.out)
-    print(
-        f"{case.candidate.name}: smallest sizes noticed at 95 % of {config.places} places; {config.out / 'ladder.csv'}"
-    )
+    where = f"{config.places} places; {config.out / 'ladder.csv'}"
+    print(f"{case.candidate.name}: smallest sizes noticed at 95 % of {where}")
     table = runner.sum_up(rows)
     write_csv(config.out / "ladder.csv", tuple(table[0]), table)
     for one in table:
-        factor, unit = {"m": (100.0, "cm")}.get(one["unit"], (1.0, one["unit"]))
-        factor, unit = (1000.0, "mm") if one["kind"] == "gauge" else (factor, unit)
+        usual = {"m": (100.0, "cm")}.get(one["unit"], (1.0, one["unit"]))
+        factor, unit = (1000.0, "mm") if one["kind"] == "gauge" else usual
         print(f"  {one['kind']} over {one['length']:g} m: {factor * one['size_95']:.2g} {unit}; "
               f"{factor * one['asked']:g} {unit} noticed at {one['noticed_at_asked']} of {one['places']}")  # fmt: skip
 
