@@ -66,8 +66,9 @@ def _is_array(value: Any) -> bool:
         return False
 
 
-def check(table: Path, name: str, value: Any, rel: float = 1e-4) -> None:
-    """A tree is what the table holds under a name, each number within `rel` of its array's size."""
+def check(table: Path | str, name: str, value: Any, rel: float = 1e-4) -> None:
+    """A tree is what the table, or that beside a test's file, holds under a name; numbers within `rel` of its size."""
+    table = Path(table).with_suffix(".csv")
     now = dict(figures(value, name))
     rows = list(csv.reader(table.open(newline=""))) if table.exists() else []
     if os.environ.get("SUBTERRA_WRITE_VALUES"):

@@ -15,8 +15,8 @@ from subterra_jax.baselines.agent import Observed
 from subterra_jax.baselines.stations import Driven, Station
 from subterra_jax.baselines.steering import Corridor
 from subterra_jax.policies import PolicyError, check_fits, from_tensors, training_conditions
-from subterra_jax.policies.locate import bends, map_filter, matching, memory, streams
-from subterra_jax.policies.locate.blocks import DELAY, Block, Estimate
+from subterra_jax.policies.locate import bends, map_filter, memory, streams
+from subterra_jax.policies.locate.blocks import DELAY, Estimate
 from subterra_jax.policies.locate.locator import Locator
 from subterra_jax.policies.locate.map_strip import map_strip
 from subterra_jax.policies.locate.profiles import BIN
@@ -24,25 +24,6 @@ from subterra_jax.policies.locate.ways import TwoWays
 from subterra_jax.policies.trained import flat
 from subterra_jax.tunnel import Tunnel
 from tests.subterra_jax.patches import HALF, N_METRES, drive_past, map_of_walls, patches
-
-
-def _random_blocks(n, key=1):
-    rng = np.random.default_rng(key)
-    evidence = 2.0 * rng.standard_normal((n, len(matching.FRACTIONS)))
-    evidence[:DELAY] = 0.0
-    return Block(
-        jnp.asarray(evidence, jnp.float32), jnp.asarray(0.03 * rng.standard_normal(n), jnp.float32), jnp.full(n, 5.0)
-    )
-
-
-def test_a_memory_gives_the_same_metre_by_metre_as_all_at_once():
-    weights = memory.init("match", jax.random.key(2))
-    blocks = _random_blocks(35)
-    whole = memory.sequence(weights, blocks)
-    one = lambda state, block: memory.step(weights, state, block)  # noqa: E731
-    stepped = jax.lax.scan(one, memory.start(), blocks)[1]
-    for name in ("correction", "fraction", "log_scale"):
-        np.testing.assert_allclose(getattr(whole, name), getattr(stepped, name), atol=2e-4)
 
 
 def _ranges(driven, fraction=0.01):

@@ -139,17 +139,6 @@ def test_the_filter_knows_how_well_it_knows(pockets):
 
 
 @pytest.mark.slow
-def test_between_smooth_walls_of_one_curvature_the_filter_is_no_better_than_dead_reckoning():
-    env, params = st.make("Subterra/StopAt-v1", tunnel="control", lining="smooth")
-    episodes = listed_episodes(env, params, 100)
-    filtered = evaluate(env, params, particle_filter(params), episodes)
-    fused = evaluate(env, params, make_agent("fused", params), episodes)
-    # Three standard errors of a difference of two rates near a third.
-    assert abs(filtered.success.mean() - fused.success.mean()) < 0.2
-    assert 0.8 < np.median(filtered.axial_rms) / np.median(fused.axial_rms) < 1.25
-
-
-@pytest.mark.slow
 def test_relocalisation_finds_place_and_direction():
     env, params = st.make("Subterra/Relocalise-v1", tunnel="subterra-351")
     found = evaluate(env, params, make_agent("particle-filter", params), listed_episodes(env, params, 20))

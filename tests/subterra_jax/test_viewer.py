@@ -20,6 +20,7 @@ from subterra_jax.viewer.chart import error_chart
 from subterra_jax.viewer.episode import Drawn, draw
 from subterra_jax.viewer.page import _Legs, write_page
 from subterra_jax.viewer.shapes import Centreline, planar_shapes
+from tests.recorded import check
 from tests.subterra_jax import tunnels
 
 
@@ -89,6 +90,7 @@ def test_walls_stand_where_the_lining_has_them_and_are_seen_from_within(centreli
         inside[:, 0] = 0.0
         assert (np.sum(normal * inside, axis=1) > 0.0).all(), shape.name
     left, right, floor = planar_shapes(centreline.plan, "pockets")
+    check(__file__, "shapes", {one.name: [one.vertices, one.faces] for one in (left, right, floor)})
     np.testing.assert_allclose(left.vertices[:, 1].min(), 2.825, atol=1e-6)
     np.testing.assert_allclose(left.vertices[:, 1].max(), 2.825 + tunnels.POCKET_DEPTH, atol=1e-6)
     assert right.vertices[:, 1].max() < 0.0 < left.vertices[:, 2].max()
@@ -97,6 +99,7 @@ def test_walls_stand_where_the_lining_has_them_and_are_seen_from_within(centreli
 
 def test_rails_and_sleepers_of_a_stretch_are_drawn(centreline):
     *_, rail, sleeper = planar_shapes(st.load_tunnel("subterra-351").slice(100.0, 60.0), "pockets")
+    check(__file__, "track", {one.name: [one.vertices, one.faces] for one in (rail, sleeper)})
     assert (rail.name, sleeper.name, len(sleeper.faces) // 12) == ("rail", "sleeper", 100)
 
 
@@ -126,6 +129,8 @@ def test_an_episode_is_the_one_that_the_evaluation_drives_and_is_drawn_where_it_
     np.testing.assert_allclose(travelled, record.travelled[0], rtol=1e-4)
     np.testing.assert_allclose(drawn.estimate[-1, 0] - drawn.truth[-1, 0], record.axial_final[0], atol=1e-3)
     assert np.isnan(drawn.estimate[0, 0])
+    rows = {name: np.asarray(one)[:20] for name, one in vars(drawn).items() if isinstance(one, np.ndarray)}
+    check(__file__, "drawn", {**rows, "ellipse": drawn.ellipse(10), "gate": drawn.gate()}, 1e-3)
     cos, sin = np.cos(drawn.heading[:, None]), np.sin(drawn.heading[:, None])
     across = drawn.truth[:, None, 1] + sin * drawn.hits[..., 0] + cos * drawn.hits[..., 1]
     seen = np.isfinite(across)
@@ -141,6 +146,20 @@ def played(path):
     return page, msgspec.msgpack.decode(raw[8 : 8 + int.from_bytes(raw[:8], "little")])
 
 
+def gathered(messages):
+    """Numbers of a page's messages by kind and node, in the order in which they are played."""
+    found = {}
+    for time, one in messages:
+        rows = found.setdefault(f"{one['type']} {one.get('name', '')}", {"time": []})
+        rows["time"].append(time)
+        for field, value in {**one, **(one.get("props") or {})}.items():
+            if isinstance(value, bytes):
+                value = len(value)
+            if np.asarray(value).dtype.kind in "if":
+                rows.setdefault(field, []).append(float(np.sum(np.cos(np.arange(np.size(value))) * np.ravel(value))))
+    return found
+
+
 def test_the_tunnel_moves_past_the_robot_and_the_page_names_what_it_shows(centreline, tmp_path):
     drawn = straight(centreline, heading=np.full(21, np.pi / 2))
     write_page(tmp_path / "a.html", drawn, planar_shapes(centreline.plan, "smooth"), 0.35, {"task": "<StopAt>"})
@@ -153,6 +172,7 @@ def test_the_tunnel_moves_past_the_robot_and_the_page_names_what_it_shows(centre
     time, place = next(each for each in placed if each[0] > 0.95)
     np.testing.assert_allclose(place, [0.0, 2.0 * time, 0.0], atol=0.08)
     names = {one.get("name") for _, one in content["messages"]}
+    check(__file__, "page", {"sent": gathered(content["messages"])})
     assert {"/robot", "/beams", "/hits", "/world/goal", "/world/estimate", "/world/odometry/robot"} <= names
     bare = straight(centreline, goal=np.nan, estimate=np.full((21, 2), np.nan))
     write_page(tmp_path / "b.html", bare, [], 0.35, {})
@@ -163,6 +183,7 @@ def test_the_chart_spans_the_errors(centreline):
     chart = error_chart(straight(centreline))
     assert re.findall(r">(-?[\d.]+)<", chart) == ["2.0", "-0.1", "0", "2"]  # m up, m down, s
     assert chart.count("<polyline") == 3 + 4
+    check(__file__, "chart", {"numbers": [float(one) for one in re.findall(r"-?\d+\.?\d*", chart)]})
 
 
 @pytest.mark.parametrize("turned", [0.0, np.pi / 2])
@@ -177,6 +198,8 @@ def test_thirteen_bodies_of_a_b2_stand_and_face_where_it_does(turned):
     legs = _Legs(SimpleNamespace(add_mesh_trimesh=add))
     legs.place(np.concatenate([[3.0, 4.0, 1.0 + STAND_HEIGHT], quaternion, standing_pose()[0]]))
     assert len(made) == 13
+    placed = {name: [node.position, node.wxyz, node.mesh.vertices] for name, node in made.items()}
+    check(__file__, f"legs {turned > 0.0}", placed)
     assert all(len(node.mesh.faces) for node in made.values())
     np.testing.assert_allclose(made["base_link"].position, [3.0, 4.0, 1.0 + STAND_HEIGHT])
     assert made["FL_hip"].position[int(turned > 0.0)] == pytest.approx((3.0, 4.0)[int(turned > 0.0)] + HIP_X)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from subterra_jax.rules import GoalParams, Traverse
+from subterra_jax.rules import GoalParams
 from tests.subterra_jax.tunnels import write_corridor
 from tests.train.conftest import weights_of
 from train import curve
@@ -49,22 +49,6 @@ def test_a_policy_learns_to_stop_at_its_goal_and_drives_as_it_was_trained(world)
     last = train(learner, world.params)
     assert evaluate(world, make_agent(learner.driver, last.policy), 100)["success"] >= LEAST
     np.testing.assert_array_less(np.exp(last.state.student.weights["log_std"]), 0.1001)
-
-
-@dataclasses.dataclass(frozen=True)
-class Fast(Traverse):
-    """Pays for speed."""
-
-    def judge(self, step, params):
-        return dataclasses.replace(super().judge(step, params), terms={"reward_speed": step.drive.motion[0]})
-
-
-def test_what_pays_becomes_likelier(tunnel):
-    env, params = st.make("Subterra/TraverseShort-v1", tunnel=str(tunnel), horizon=20)
-    fast = World("Subterra/TraverseShort-v1", dataclasses.replace(env, rule=Fast()), params, {})
-    paid = []
-    train(make_learner(fast, TINY), params, log=lambda line: paid.append(line["reward_speed"]))
-    assert paid[-1] > paid[0] + 0.1
 
 
 def test_robots_whose_truth_alone_differs_read_and_do_the_same_and_are_asked_for_something_else(world):

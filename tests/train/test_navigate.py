@@ -22,6 +22,7 @@ from subterra_jax.b2.transfer import LaggedWheels
 from subterra_jax.host.errors import OutputError
 from subterra_jax.policies import PolicyError, load
 from subterra_jax.policies.files import read
+from tests.recorded import check
 from tests.train.conftest import SMALL, TASK, call
 from train import __main__ as navigate
 from train import checkpoint, curve, walk
@@ -225,6 +226,7 @@ def test_the_critic_s_observation_is_the_policy_s_and_more():
     plain = dataclasses.replace(env, privileged=False)
     assert plain.observation_size(params) == N_SEEN
     assert env.observation_size(params) == N_SEEN + N_TRUTH
+    check(__file__, "critic", {"seen": jax.jit(env.reset)(jax.random.key(0), params)[0]})
 
 
 @pytest.mark.slow

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from subterra_jax.policies import load
+from tests.recorded import check
 from tests.train.conftest import SMALL, TASK, log_without_timing
 from train import checkpoint, folder, session
 from train.config import TrainConfig
@@ -32,6 +33,7 @@ def whole(train_small):
     """A run that nobody killed."""
     status, out = train_small(*FEW)
     assert status == 0
+    check(__file__, "whole", {"log": log_without_timing(out)[:2]}, 1e-2)
     return out
 
 
@@ -95,6 +97,7 @@ def test_with_every_memory_a_run_goes_on_from_a_checkpoint_to_the_same_weights_t
     again = train(learner, world.params, snapshot=snapshot)
     jax.tree.map(np.testing.assert_array_equal, again.state, whole.state)
     assert {**again.record, "timing": None} == {**whole.record, "timing": None}
+    check(__file__, f"learns {memory}", {"line": {**whole.record, "timing": None}}, 1e-2)
 
 
 @pytest.mark.parametrize(

@@ -16,12 +16,12 @@ from gymnasium.error import ResetNeeded
 import subterra_jax as st
 from subterra_jax.adapters.kernel import pack
 from subterra_jax.b2 import tasks
-from subterra_jax.b2.params import CommandParams, SensorParams
+from subterra_jax.b2.params import SensorParams
 from subterra_jax.physics.ground import TrackError
 from subterra_jax.physics.rotations import yaw
 from subterra_jax.physics.stage import RobotError
 from subterra_jax.policies import PolicyError
-from tests.subterra_jax.placing import draw
+from tests.recorded import check
 
 ID = "Subterra/B2Traverse-v1"
 QUIET = {"rate": 0.0, "gravity": 0.0, "angle": 0.0, "speed": 0.0}
@@ -97,6 +97,7 @@ def test_told_to_stand_it_stands_and_a_nan_is_a_zero(env):
 def test_the_same_seed_gives_the_same_walk_and_another_one_another(env):
     walks = [np.stack([step[0] for step in drive(env, (0.5, 0.2), 4, seed)]) for seed in (7, 7, 8)]
     np.testing.assert_array_equal(walks[0], walks[1])
+    check(__file__, "walk", {"seen": walks[0], "other": walks[2]}, 5e-3)
     assert not np.array_equal(walks[0], walks[2])
 
 
@@ -147,30 +148,12 @@ def test_success_is_the_share_of_the_tunnel_that_the_rule_asks_for(env):
     assert outcome[-1][4]["coverage"] >= 0.052
 
 
-@pytest.fixture(scope="module")
-def walk(plan):
-    onward = CommandParams(low=(0.5, 0.0, 0.0), high=(0.5, 0.0, 0.0), still=0.0)
-    return gymnasium.make("Subterra/B2Walk-v1", tunnel=plan, command=onward)
-
-
 def test_gymnasium_knows_the_walking_task_by_its_id(plan):
     inner: Any = gymnasium.make("Subterra/B2Walk-v1", tunnel=plan).unwrapped
     assert (inner.action_space.shape, inner.observation_space.shape) == ((12,), (56,))
     assert inner.walk.physics.period == pytest.approx(0.02)
     with pytest.raises(ResetNeeded):
         inner.step(np.zeros(12))
-
-
-@pytest.mark.slow
-def test_the_zero_action_walks_as_it_is_told_in_mujoco_too(walk):
-    assert walk.action_space.shape == (12,)
-    assert walk.metadata["render_fps"] == 50
-    outcome = drive(walk, np.zeros(12), 150, seed=3)
-    again = drive(walk, np.full(12, np.nan), 5, seed=3)
-    np.testing.assert_array_equal(outcome[4][0], again[4][0])
-    assert not any(step[2] for step in outcome)
-    ahead = [step[4]["velocity"][0] for step in outcome[75:]]  # m/s, once it is under way
-    assert 0.2 < np.mean(ahead) < 0.8
 
 
 def test_who_asks_for_what_is_not_there_is_told_in_a_sentence(plan, tmp_path):
@@ -194,30 +177,6 @@ def test_who_asks_for_what_is_not_there_is_told_in_a_sentence(plan, tmp_path):
                 st.make(asked[0], **{**in_scene, "engine": engine}, **asked[1])
         with pytest.raises(ValueError, match="either a tunnel or a scene, got both 'metro'"):
             st.make(asked[0], "metro", **in_scene, **asked[1])
-
-
-DRAW = """
-import sys
-import imageio.v3 as imageio
-import numpy as np
-import subterra_jax as st
-from subterra_jax.b2.gym import B2Env
-from subterra_jax.pictures.renderer import PictureError
-env = B2Env(tunnel=st.load_tunnel().slice(0.0, 10.0), policy="trot", render_mode="rgb_array", width=160, height=120)
-env.reset(seed=0)
-try:
-    np.save(sys.argv[1], env.render())
-except PictureError as cause:
-    sys.exit(str(cause))
-env.close()
-"""
-
-
-@pytest.mark.slow
-def test_the_robot_is_drawn_where_there_is_opengl(tmp_path):
-    picture, _ = draw(DRAW, tmp_path / "picture.npy")
-    assert picture.shape == (120, 160, 3)
-    assert picture.std() > 10.0
 
 
 def test_a_lidar_in_three_dimensions_stands_on_the_trunk(plan):

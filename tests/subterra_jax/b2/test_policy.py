@@ -15,6 +15,7 @@ from subterra_jax.b2 import tasks, transfer
 from subterra_jax.b2.transfer import LaggedWheels, NoddingLidar, stand_in
 from subterra_jax.evaluation import listed_episodes
 from subterra_jax.policies import load
+from tests.recorded import check
 from tests.subterra_jax import placing
 
 
@@ -86,8 +87,10 @@ def test_beams_that_point_down_end_on_the_ballast_and_no_others_change():
     env, params = st.make("Subterra/TraverseShort-v1", vehicle=tasks.VEHICLE, start=tasks.START)
     level = stand_in(env, lidar=NoddingLidar((0.0, 0.0, 0.0)))
     nose_down = stand_in(env, lidar=NoddingLidar((0.1, 0.0, 0.0)))
+    nodding = stand_in(env, LATE, NoddingLidar((0.02, 0.05, 0.01)))
     key = jax.random.key(0)
-    (flat, _), (bent, _) = (jax.jit(one.reset)(key, params) for one in (level, nose_down))
+    (flat, _), (bent, _), (nodded, _) = (jax.jit(one.reset)(key, params) for one in (level, nose_down, nodding))
+    check(__file__, "nodding", {"seen": nodded})
     assert float(bent[0]) == pytest.approx(0.75 / np.sin(0.1), rel=1e-5)
     assert float(flat[0]) > float(bent[0])
     np.testing.assert_array_equal(bent[4:13], flat[4:13])  # to the sides and behind
@@ -121,6 +124,7 @@ def test_figures_of_four_robots_are_what_one_counts_by_hand():
         sway=np.array([[[0.3], [-0.4], [np.nan], [np.nan]]]),
     )
     outcome = transfer.figures(walk, rows, PARAMS)
+    check(__file__, "figures", outcome)
     assert outcome["robots"] == 4
     assert (outcome["success_percent"], outcome["fall_percent"], outcome["contact_percent"]) == (50.0, 25.0, 25.0)
     assert outcome["coverage_median_percent"] == pytest.approx(60.0)

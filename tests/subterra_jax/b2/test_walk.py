@@ -11,6 +11,7 @@ import subterra_jax as st
 from subterra_jax.b2 import constants as b2
 from subterra_jax.b2.observation import locate
 from subterra_jax.physics.rotations import rotate
+from tests.recorded import check, named
 from tests.subterra_jax.b2.conftest import N_ROBOTS
 
 
@@ -59,6 +60,10 @@ def test_terms_of_the_reward_sum_to_the_reward_and_the_info_has_the_contract_s_k
     paid = sum(np.asarray(value) for name, value in info.items() if name.startswith("reward_"))
     np.testing.assert_allclose(reward, paid, rtol=1e-5)
     assert {"coverage", "station", "lateral", "contact", "success", "fall", "final_observation"} <= info.keys()
+    for k in range(4):
+        told = walking.step(k, state, 0.5 * jnp.sin(jnp.arange(12.0) + k) * jnp.ones((N_ROBOTS, 1)))
+        state = told[1]
+    check(__file__, "steps", named(told), 2e-3)
 
 
 def test_the_observation_has_the_size_and_the_parts_it_claims(walking):

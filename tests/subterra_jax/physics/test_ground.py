@@ -15,6 +15,7 @@ from subterra_jax.physics.ground import RAIL_HALF, RAIL_OFFSET, TrackError, join
 from subterra_jax.physics.rotations import rotate
 from subterra_jax.tunnel import Tunnel
 from subterra_jax.tunnel.shell import make_bricks
+from tests.recorded import check, named
 from tests.subterra_jax.tunnels import straight, tunnel_arrays
 
 FORWARD = jnp.array([1.0, 0.0, 0.0])
@@ -124,6 +125,22 @@ def gaps(floor, railway):
         return np.asarray(gap)[order], np.asarray(normal)[order]
 
     return least
+
+
+@pytest.mark.parametrize("name", ["subterra-351", "metro"])
+def test_what_lies_about_a_robot_is_what_it_was(name):
+    """Sleepers, rails, walls and drop under four feet, on a grade, in bends and beside the walls."""
+    plan = st.load_tunnel(name)
+    track, tunnel = read_track(plan), Tunnel.from_plan(plan)
+    feet = jnp.array([[0.35, 0.2, -0.5], [0.35, -0.2, -0.5], [-0.35, 0.9, -0.5], [-0.35, -2.2, -0.4]])
+
+    def look(station, aside, yaw):
+        anchor = track.nearest(station, 0)
+        qpos = jnp.array([0.1, aside, 0.55, jnp.cos(yaw / 2), 0.0, 0.02, jnp.sin(yaw / 2)])
+        return ground.look_around(track, tunnel, anchor, qpos, feet), move_anchor(track, anchor, 9.0 * qpos[:3])
+
+    places = [jnp.array(row, jnp.float32) for row in ((60.0, 150.0, 240.3), (0.0, 1.1, -1.9), (0.0, 0.6, 2.9))]
+    check(__file__, name, named(jax.jit(jax.vmap(look))(*places)), 1e-3)
 
 
 def test_a_ball_is_as_far_as_geometry_says_from_floor_sleeper_and_rail(gaps):

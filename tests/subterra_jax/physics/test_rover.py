@@ -21,6 +21,7 @@ from subterra_jax.physics.warp import INSTALLED, WarpEngine
 from subterra_jax.policies.opening import open_agent
 from subterra_jax.rules import StartParams
 from subterra_jax.tunnel import Tunnel
+from tests.recorded import check, named
 from tests.subterra_jax.physics.test_ground import sleepers
 from tests.subterra_jax.tunnels import straight, tunnel_arrays
 
@@ -211,6 +212,8 @@ def test_its_task_is_that_of_the_kinematic_robot(task, plans):
     beside, _ = go([(1.0, 0.1)] * 40, track=params.track.replace(protrusion=params.track.protrusion + 0.06))
     assert beside[-1, at] * rover.ROLLED / rover.ROLLED_ON_SLEEPERS == pytest.approx(obs[-1, at], rel=0.02)
     assert not any(bool(step[2]) for step in outcome)
+    told = jax.tree.map(lambda *rows: np.stack(rows), *outcome[:10])
+    check(__file__, "task", {"seen": obs[:11], **named(told)}, 2e-3)
 
 
 def test_in_a_stack_it_stands_on_the_ground_of_its_own_tunnel(plans):
@@ -221,6 +224,7 @@ def test_in_a_stack_it_stands_on_the_ground_of_its_own_tunnel(plans):
     place = params.track.position[rides.anchor] + rides.body.qpos[:, :3]
     np.testing.assert_array_equal(params.track.tunnel[rides.anchor], [0, 1, 2])
     np.testing.assert_allclose(place[:, :2], fresh.state.position, atol=0.02)
+    check(__file__, "stack", named((fresh.state, params.track)))
 
 
 def test_a_wall_ends_its_episode_by_contact(task):

@@ -23,6 +23,7 @@ from subterra_jax.recorder.messages import EPOCH, laser_scan, odometry, store
 from subterra_jax.recorder.sensors import GRAVITY, Poses, measure_imu, reckoned_poses, true_poses
 from subterra_jax.recorder.trace import Trace
 from subterra_jax.state import State
+from tests.recorded import check, named
 
 TASK = "Subterra/StopAtShort-v1"
 TYPES = get_typestore(Stores.ROS2_JAZZY)
@@ -65,6 +66,14 @@ def test_rosbags_reads_what_the_agent_saw_and_did(config, trace, messages):
     np.testing.assert_allclose(commanded, trace.command, rtol=1e-6)
     np.testing.assert_allclose([time for time, _ in messages["/scan"]], trace.time, atol=1e-6)
     one = messages["/scan"][5][1]
+    bag = {
+        topic: [dataclasses.asdict(sent) for _, sent in some[:20]]
+        for topic, some in messages.items()
+        if topic != "/scan"
+    }
+    check(__file__, "messages", bag, 1e-3)
+    few = {name: np.atleast_1d(values)[:20] for name, values in named(vars(trace)).items()}
+    check(__file__, "trace", few, 1e-3)
     assert one.angle_min + 15 * one.angle_increment == pytest.approx(one.angle_max)
     assert one.header.stamp.sec + 1e-9 * one.header.stamp.nanosec == pytest.approx(EPOCH + 0.5)
 
@@ -216,6 +225,7 @@ def test_an_imu_on_a_circle_feels_the_turn_the_pull_inwards_and_gravity():
     expected = np.broadcast_to([0.0, speed * rate, GRAVITY], true.accel[inner].shape)
     np.testing.assert_allclose(true.accel[inner], expected, atol=2e-3)
     noisy = measure_imu(poses, seed=0)
+    check(__file__, "imu", {"gyro": noisy.gyro, "accel": noisy.accel})
     assert 0.004 < np.std(noisy.gyro[:, 2] - true.gyro[:, 2]) < 0.006
     np.testing.assert_array_equal(measure_imu(poses, seed=0).accel, noisy.accel)
 
