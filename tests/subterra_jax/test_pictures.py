@@ -1,15 +1,25 @@
 """Pictures without a scene: surfaces lie where the tunnel is, face the camera, and the robot stands in them whole."""
 
+from pathlib import Path
+
+import jax
+import mujoco
 import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
 import subterra_jax as st
 from subterra_jax.host.texture import brightness, wall_angle
+from subterra_jax.pictures import top_down as drawing
 from subterra_jax.pictures.camera import TunnelChoice
-from subterra_jax.pictures.stage import Stretch, carrier_parts, stage_spec
+from subterra_jax.pictures.renderer import light_near
+from subterra_jax.pictures.stage import Stretch, add_carrier, carrier_parts, stage_spec
 from subterra_jax.pictures.surfaces import short_shell, tunnel_surfaces
-from tests.subterra_jax.placing import draw
+from subterra_jax.pictures.views import make_view
+from tests.recorded import arrays_of, check
+from tests.subterra_jax.placing import draw, placed
+
+TABLE = Path(__file__).with_name("values.csv")
 
 
 @pytest.fixture(scope="module")
@@ -70,6 +80,46 @@ def test_a_stage_is_for_looks_alone(plan):
     assert not model.geom_conaffinity.any()
     assert model.nbody == 1
     assert model.nlight >= 1
+
+
+@pytest.mark.parametrize(
+    ("name", "lining", "begin", "end"),
+    [("metro", "furnished", 100.0, 108.0), ("open:val:0", None, 0.0, 20.0), ("open:cast:val:1", "smooth", 10.0, 19.0)],
+)
+def test_a_stage_holds_what_it_held(name, lining, begin, end):
+    plan = st.load_tunnel(name, solid=name != "open:val:0")
+    model = stage_spec(Stretch(plan, lining, begin, end, 1.0)).compile()
+    check(TABLE, f"stage {name}", {**arrays_of(model), "pixels": model.tex_data})
+    seen = {one.name: (one.triangles.vertices, one.rolled) for one in tunnel_surfaces(plan, lining, begin, end)}
+    check(TABLE, f"surfaces {name}", seen)
+
+
+def test_the_seven_nearest_lamps_burn_and_the_carrier_is_what_it_was(plan):
+    model = stage_spec(Stretch(plan, "smooth", 100.0, 190.0)).compile()
+    data, scene = mujoco.MjData(model), mujoco.MjvScene(model, 50)
+    mujoco.mj_forward(model, data)
+    light_near(model, data, data.light_xpos[2])
+    assert np.flatnonzero(model.light_active).tolist() == [0, 1, 2, 3, 4, 5, 6]
+    add_carrier(scene, np.array([1.0, 2.0, 3.0]), 0.3, 0.1, 0.4, 0.7)
+    geoms = scene.geoms[: scene.ngeom]
+    check(TABLE, "carrier", {k: np.stack([getattr(geom, k) for geom in geoms]) for k in ("pos", "mat", "size", "rgba")})
+
+
+def test_walls_goal_beams_and_robot_are_seen_from_above_where_they_are():
+    straight = st.tunnel.from_centreline([[0.0, 0.0], [100.0, 0.0]], 2.5)
+    env, params = st.make("Subterra/StopAtShort-v1", straight, lidar=st.lidar.LidarParams(range_sigma=0.0))
+    state = placed(env, params, 40.0)
+    state = state.replace(goal=state.goal.replace(station=np.float32(43.1)))
+    obs = env.observe(state, env.draw_step(jax.random.key(0), (), params), params)
+    picture = make_view("top").picture(env, params, state, np.asarray(obs))
+    expected = {
+        drawing.WALL: (-12.0, 12.0, -2.5, 2.5), drawing.GOAL: (3.1, 3.1, -2.5, 2.5),
+        drawing.ROBOT: (-0.4, 0.8, -0.4, 0.4), drawing.BEAM: (-12.0, 12.0, -2.5, 2.5),
+    }  # fmt: skip
+    for colour, sides in expected.items():
+        rows, columns = np.nonzero((picture == colour).all(axis=2))
+        x, y = (columns + 0.5 - 240.0) / 20.0, (240.0 - rows - 0.5) / 20.0
+        assert [x.min(), x.max(), y.min(), y.max()] == pytest.approx(sides, abs=0.13)
 
 
 def test_the_walls_show_the_brightness_that_a_lidar_reads(plan):
