@@ -59,12 +59,6 @@ def test_a_pocket_is_as_deep_and_as_long_as_given():
     np.testing.assert_allclose(ranges(plan, 60.0, lining="smooth")[[1, 3]], 2.5, atol=1e-3)
 
 
-def test_half_widths_may_change_along_the_tunnel():
-    plan = st.tunnel.from_centreline(LINE, np.linspace(2.0, 3.0, len(LINE)))
-    np.testing.assert_allclose(ranges(plan, 60.0)[[1, 3]], 2.5, atol=1e-3)
-    assert plan.half_width[0] == pytest.approx(2.0)
-
-
 def test_the_line_midway_between_bent_walls_is_their_middle():
     plan = st.tunnel.from_polylines(bend(60.0, offset=2.5), bend(60.0, offset=-2.5))
     given = st.tunnel.from_centreline(bend(60.0), 2.5)

@@ -162,12 +162,3 @@ def test_a_recess_wide_enough_for_the_robot_is_seen_from_within(plan_of):
     ranges = device_scans(Tunnel.from_plan(plan, "smooth"), poses)
     result = reference.agreement(plan.lining("smooth").segments, poses, ranges)
     assert (result.n_wrong, result.max_error < 1e-3) == (0, True)
-
-
-def test_the_cost_of_a_scan_does_not_grow_with_the_tunnel(plan_of):
-    short, long = (
-        Tunnel.from_plan(plan_of(tunnels.tunnel_arrays(tunnels.straight(length))), "pockets")
-        for length in (100.0, 400.0)
-    )
-    assert abs(short.n_scan - long.n_scan) <= 2
-    assert short.wall.shape[2] == long.wall.shape[2]

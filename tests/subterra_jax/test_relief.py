@@ -84,6 +84,8 @@ def test_a_surface_too_fine_for_the_integers_gets_shorter_blocks_or_is_refused(m
     monkeypatch.setattr(cells, "MOST_VERTICES", 60)
     with pytest.raises(TunnelError, match="too fine for the LiDAR: 8192 triangles over 16 m"):
         cells.sort_triangles(axis, tube, 4.0)
+    with pytest.raises(ValueError, match="no triangle lies along the axis"):
+        Relief.from_triangles(axis, surface.Triangles(*surfaces.box((500.0, 0.0, 0.0), (1.0, 1.0, 1.0))))
 
 
 def test_what_cannot_be_stacked_is_refused():
@@ -93,13 +95,6 @@ def test_what_cannot_be_stacked_is_refused():
     with pytest.raises(ValueError, match="relief 0 is a stack of 2"):
         relief.stack_reliefs([relief.stack_reliefs([one, one])])
     assert relief.stack_reliefs([one]) is one
-
-
-def test_a_surface_away_from_the_axis_is_refused():
-    axis = surfaces.axis_of(30.0)
-    far = surfaces.box((500.0, 0.0, 0.0), (1.0, 1.0, 1.0))
-    with pytest.raises(ValueError, match="no triangle lies along the axis"):
-        Relief.from_triangles(surface.Axis(**axis), surface.Triangles(*far))
 
 
 def upright():
