@@ -45,13 +45,6 @@ def test_every_error_of_an_episode_has_a_draw_of_its_own():
     np.testing.assert_allclose(errors, np.eye(4), atol=4.5 / np.sqrt(N))  # of independent numbers: 1 / sqrt(N)
 
 
-def test_distance_and_heading_have_noise_of_their_own():
-    params = odometry.OdometryParams(0.01, 0.0, 0.001, 0.0)
-    state = fresh(odometry.Odometer(), jnp.zeros(2), odometry=params)
-    after = [odometry.advance_odometry(state, jnp.zeros(2), jnp.float32(0.1), row, params) for row in jnp.eye(2)]
-    np.testing.assert_allclose([[one.distance, one.heading] for one in after], [[0.01, 0.0], [0.0, 0.001]], rtol=1e-6)
-
-
 def test_the_size_of_the_steps_does_not_matter_to_a_wandering_error():
     one = slip.advance_wander(jnp.float32(0.02), jnp.float32(30.0), jnp.float32(0.0), PARAMS)
     np.testing.assert_allclose(one, 0.02 * np.exp(-1.0), rtol=1e-5)
