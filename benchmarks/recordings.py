@@ -47,7 +47,7 @@ from scene.writing.track import lay_track
 _EVERY = 6  # firings of the VLP-16 of which one is kept
 _AVIA_RATE = 60_000  # points/s
 _COMPARED = 12  # sweeps of a recording that are compared point by point
-_LATE, _CLOCK = 0.005, 0.010  # s: errors of a point's time, and of a clock, that count as noise
+_CLOCK = 0.010  # s: error of a point's time or of a clock that counts as noise
 _APART, _LONGER = 0.015, 0.10  # m: of two walls, RMS, and of two bores' lengths, that count as noise
 _DROPPED = 0.001  # fraction of the good points that may be left out, as is said
 _MOST_BAD = 0.05  # fraction of bad times that the reader states as its limit

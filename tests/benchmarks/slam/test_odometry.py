@@ -21,8 +21,10 @@ from scene.survey.cast import Caster, Face, sweeps
 from scene.survey.config import SensorErrors
 from scene.survey.mesh import Part
 from subterra_jax.host.texture import brightness, wall_angle
+from tests.recorded import check
 
 SEED, BATCH_SEED = np.random.SeedSequence(4), 5
+VALUES = Path(__file__).with_name("values.csv")
 KEPT = 34  # sweeps of the rest that tests leave out
 
 
@@ -98,26 +100,54 @@ def advance(step, scene, skip=KEPT):
     return abs((way[-1] - way[0])[0] - scene.course.distance) / scene.course.distance  # ahead is forward
 
 
-def test_smooth_walls_are_driven_by_their_brightness():
-    assert advance(odometry.by_brightness(), drawn(1.0), 28) < 0.03
-
-
-@pytest.mark.slow
-def test_without_brightness_the_way_is_lost():
-    assert advance(odometry.by_brightness(), drawn(0.0), 28) > 0.9
-
-
 def test_doppler_gives_the_way_where_walls_are_smooth():
     assert advance(odometry.by_doppler(), drawn(0.0, doppler=True), 28) < 0.01
 
 
-def test_poses_are_of_the_ends_of_sweeps(monkeypatch):
-    points, rest = np.ones(9, DOPPLER_POINT), (np.array([0.0, 0.0, 9.81]), np.zeros(3))
-    samples = [(1_900_000_000, rest), (2_000_000_000, points), (2_100_000_000, points)]
+RATE, BIAS = np.array([0.0, 0.0, 0.12]), np.array([0.01, -0.02, 0.03])  # rad/s
+START, LOOKS = 1.2, 0.3  # s; rad to the left
+
+
+def tube(texture, noise):
+    """Samples of a drive at 1 m/s down a round tube, after a rest; the true attitude at times."""
+    rng, n, samples = np.random.default_rng(0), 4000, []
+    wave = rng.uniform(2.0, 9.0, 40), rng.integers(-9, 10, 40), rng.uniform(0.0, 7.0, 40)
+    rest = Rotation.from_euler("ZYX", [LOOKS, 0.05, -0.04])
+    attitude = lambda t: rest * Rotation.from_rotvec(np.outer(np.maximum(t - START, 0.0), RATE))  # noqa: E731
+    for t in np.arange(1, 481) / 200.0:
+        force = attitude(np.array([t]))[0].inv().apply([0.0, 0.0, 9.81])
+        samples.append((t, round(1e9 * t), (force, BIAS + RATE * (t > START))))
+    for begin in np.arange(1.0, 2.35, 0.1):
+        t, turn, ahead = begin + np.linspace(0.0, 0.0999, n), rng.uniform(-np.pi, np.pi, n), rng.uniform(-6.5, 6.5, n)
+        ray = np.stack([ahead, 2.8 * np.cos(turn), 2.8 * np.sin(turn)], axis=1)
+        far, points = np.linalg.norm(ray, axis=1), np.zeros(n + 1, DOPPLER_POINT)  # the last came back from nowhere
+        bright = np.cos(np.outer(np.maximum(t - START, 0.0) + ahead, wave[0]) + np.outer(turn, wave[1]) + wave[2]).sum(
+            axis=1
+        )
+        for name, column in zip("xyz", attitude(t).inv().apply(ray).T, strict=True):
+            points[name][:n] = column
+        points["intensity"][:n] = 40.0 * np.exp(0.15 * texture * bright + noise * rng.normal(size=n)) / far
+        points["t"][:n], points["velocity"][:n] = np.rint(1e9 * (t - begin)), -ahead / far * (t > START)
+        samples.append((begin + 0.1, round(1e9 * begin), points))
+    return [row[1:] for row in sorted(samples, key=lambda row: row[0])], attitude
+
+
+@pytest.mark.parametrize(("make", "texture", "noise"), [
+    (odometry.by_doppler, 0.0, 0.0), (odometry.by_brightness, 1.0, 0.0), (odometry.by_brightness, 0.2, 2.0),
+])  # fmt: skip
+def test_the_way_down_a_tube_and_the_attitude_are_found_at_the_ends_of_sweeps(make, texture, noise, monkeypatch):
+    samples, attitude = tube(texture, noise)
     monkeypatch.setattr(odometry, "read_samples", lambda path: iter(samples))
-    times, poses, _ = odometry.run(lambda: lambda seen, attitude, rate: np.array([1.0, 2.0, 3.0]), Path("a.bag"))
-    np.testing.assert_allclose(times, [2.1, 2.2])
-    np.testing.assert_allclose(poses[:, :3, 3], [[1.0, 2.0, 3.0]] * 2)
+    time, poses, seconds = odometry.run(make, Path("a.bag"))
+    np.testing.assert_allclose(time, np.arange(1.1, 2.45, 0.1))
+    yaw, *tilt = (Rotation.from_matrix(poses[:, :3, :3]) * attitude(time).inv()).as_euler("ZYX").T
+    np.testing.assert_allclose([yaw + LOOKS, *tilt], 0.0, atol=2e-3)
+    assert 0.0 < seconds < 5.0
+    if noise == 0.0:
+        way, aside = np.array([[np.cos(LOOKS), -np.sin(LOOKS)], [np.sin(LOOKS), np.cos(LOOKS)]]) @ poses[:, :2, 3].T
+        np.testing.assert_allclose(np.diff(way)[7:], 0.1, atol=0.005)
+        np.testing.assert_allclose(aside, 0.0, atol=0.012)
+    check(VALUES, f"{make.__name__} {100 * texture:.0f}", poses[:, :3, 3])
 
 
 def test_recordings_without_the_channel_are_refused():

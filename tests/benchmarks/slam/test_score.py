@@ -1,7 +1,9 @@
 """The scorer: errors whose size is known, `evo` beside it, and what it refuses."""
 
 import copy
+import dataclasses
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,9 +14,11 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.command import BenchmarkError
 from benchmarks.slam.__main__ import command
-from benchmarks.slam.score import HEAD, as_rows, score_files
+from benchmarks.slam.score import HEAD, ScoreConfig, as_json, as_markdown, as_rows, doubts, score_all, score_files
 from tests.benchmarks.slam.tracks import bend, line, write_axis, write_tum
+from tests.recorded import check
 
+VALUES = Path(__file__).with_name("values.csv")
 MOVE = Rotation.from_rotvec([0.1, -0.2, 1.9]), np.array([40.0, -7.0, 3.0])
 
 
@@ -79,40 +83,8 @@ def test_round_a_bend_the_axis_turns_along(tmp_path):
     assert score_files(estimate, back, alignment="none")[0].along_final == pytest.approx(0.7, abs=1e-3)
 
 
-@pytest.fixture(scope="module")
-def pair(tmp_path_factory):
-    """A bend, and a noisy estimate of it in another frame, with fewer poses."""
-    folder = tmp_path_factory.mktemp("evo")
-    time, position, rotation = bend(600)
-    rng = np.random.default_rng(3)
-    drift = np.cumsum(rng.normal(0.0, 0.02, (600, 3)), axis=0)
-    turn = Rotation.from_rotvec(np.cumsum(rng.normal(0.0, 0.002, (600, 3)), axis=0))
-    truth = write_tum(folder / "truth.tum", time, position, rotation)
-    some = slice(3, None, 2)
-    noisy = moved(position + drift, rotation * turn)
-    return write_tum(folder / "e.tum", time[some], noisy[0][some], noisy[1][some]), truth
-
-
 @pytest.mark.parametrize("alignment", ["none", "origin", "se3"])
-def test_absolute_errors_are_those_of_evo(pair, alignment):
-    estimate, truth = (file_interface.read_tum_trajectory_file(str(path)) for path in pair)
-    truth, estimate = sync.associate_trajectories(truth, estimate)
-    estimate = copy.deepcopy(estimate)
-    if alignment == "origin":
-        estimate.align_origin(truth)
-    elif alignment == "se3":
-        estimate.align(truth)
-    found, _ = score_files(*pair, alignment=alignment)
-    assert found.poses == estimate.num_poses == 299
-    relations = evo_metrics.PoseRelation
-    for relation, ours in ((relations.translation_part, found.ape), (relations.rotation_angle_deg, found.ape_turn)):
-        metric = evo_metrics.APE(relation)
-        metric.process_data((truth, estimate))
-        assert ours == pytest.approx(metric.get_all_statistics()["rmse"], abs=1e-6), relation
-
-
-@pytest.mark.parametrize("alignment", ["none", "origin", "se3"])
-def test_errors_along_across_and_up_are_those_of_evo_axis_by_axis(tmp_path, alignment):
+def test_errors_are_those_of_evo_as_a_whole_and_axis_by_axis(tmp_path, alignment):
     time, position, rotation = line()
     # The tunnel leads along x of no frame: turned by 30°, without a slope, as `axis.csv` of a level bore.
     bore = Rotation.from_euler("z", 30.0, degrees=True)
@@ -123,19 +95,26 @@ def test_errors_along_across_and_up_are_those_of_evo_axis_by_axis(tmp_path, alig
     rng = np.random.default_rng(5)
     drift = np.cumsum(rng.normal(0.0, 0.02, (len(time), 3)), axis=0)
     turn = Rotation.from_rotvec(np.cumsum(rng.normal(0.0, 0.002, (len(time), 3)), axis=0))
-    paths = (write_tum(tmp_path / "e.tum", time, position + drift, rotation * turn),
+    some = slice(3, None, 2)
+    paths = (write_tum(tmp_path / "e.tum", time[some], (position + drift)[some], (rotation * turn)[some]),
              write_tum(tmp_path / "truth.tum", time, position, rotation))  # fmt: skip
-    estimate, truth = (copy.deepcopy(file_interface.read_tum_trajectory_file(str(path))) for path in paths)
+    estimate, truth = (file_interface.read_tum_trajectory_file(str(path)) for path in paths)
+    truth, estimate = sync.associate_trajectories(truth, copy.deepcopy(estimate))
     if alignment == "origin":
         estimate.align_origin(truth)
     elif alignment == "se3":
         estimate.align(truth)
-    metric = evo_metrics.APE(evo_metrics.PoseRelation.translation_part)
-    metric.process_data((truth, estimate))
+    relations = evo_metrics.PoseRelation
+    turned, metric = (evo_metrics.APE(part) for part in (relations.rotation_angle_deg, relations.translation_part))
+    for one in (turned, metric):
+        one.process_data((truth, estimate))
     theirs = bore.inv().apply(estimate.positions_xyz - truth.positions_xyz)
     np.testing.assert_allclose(np.linalg.norm(theirs, axis=1), metric.error, atol=1e-9)
     found, error = score_files(*paths, alignment=alignment)
     np.testing.assert_allclose(error, theirs, atol=1e-6)
+    assert found.poses == estimate.num_poses == 199
+    assert found.ape == pytest.approx(metric.get_all_statistics()["rmse"], abs=1e-6)
+    assert found.ape_turn == pytest.approx(turned.get_all_statistics()["rmse"], abs=1e-6)
     ours = (found.along_rms, found.across_rms, found.up_rms)
     np.testing.assert_allclose(ours, np.sqrt(np.mean(theirs**2, axis=0)), atol=1e-6)
     assert found.along_final == pytest.approx(theirs[-1, 0], abs=1e-6)
@@ -155,6 +134,38 @@ def test_poses_of_a_camera_are_refused_and_a_bad_program_is_scored(tmp_path):
     assert score_files(still, truth)[0].drift == pytest.approx(100.0, abs=1.0)
     back = np.concatenate([position[:200], position[199::-1]])
     assert score_files(write_tum(tmp_path / "back.tum", time, back, rotation), truth)[0].drift > 50.0
+
+
+def test_scores_of_a_drive_there_and_back_round_a_bend_are_those_of_the_table(tmp_path):
+    time, position, rotation = bend(600)
+    there = np.concatenate([np.arange(450), np.arange(449, 299, -1)])  # the axis is that of the way there
+    position, rotation = position[there] + np.outer(np.sin(0.01 * there), [0.0, 0.0, 3.0]), rotation[there]
+    rng = np.random.default_rng(3)
+    drift = np.cumsum(rng.normal(0.0, [0.02, 0.01, 0.005], (600, 3)), axis=0)
+    turn = rotation * Rotation.from_rotvec(np.cumsum(rng.normal(0.0, 0.002, (600, 3)), axis=0))
+    late = np.concatenate([time, time[-1] + 0.2 * np.arange(1, 8)])  # goes on for 1.4 s
+    more = [slice(None), *[slice(-1, None)] * 7]
+    estimate = write_tum(tmp_path / "mine" / "one.tum", late, np.concatenate([(position + drift)[k] for k in more]),
+                         Rotation.concatenate([turn[k] for k in more]))  # fmt: skip
+    truth = write_tum(tmp_path / "truth" / "one" / "lidar.tum", time, position, rotation)
+    scores = []
+    for alignment in ("none", "origin", "se3"):
+        config = ScoreConfig((estimate.parent,), tmp_path / "truth", alignment=alignment)
+        found, _ = score_all(config)
+        assert ["1 s of poses lie after" in one for one in doubts(config, found)] == [True]
+        _, error = score_files(estimate, truth, alignment=alignment)
+        check(VALUES, f"score {alignment}", {**dataclasses.asdict(found[0]), "error": error})
+        scores += found
+    content = json.loads(as_json(scores, {"date": "today"}))
+    check(VALUES, "scores", {"page": as_markdown(scores), "names": [*content], "rows": len(content["scores"])})
+
+
+@pytest.mark.parametrize(("aside", "straight"), [(0.9, True), (1.3, False)])
+def test_a_way_within_a_hundredth_of_its_length_is_straight(tmp_path, aside, straight):
+    time, position, rotation = line()
+    position = position + np.column_stack([0.0 * time, aside * np.sqrt(2.0) * np.sin(time), 0.0 * time])
+    truth = write_tum(tmp_path / "truth.tum", time, position, rotation)
+    assert score_files(truth, truth)[0].straight == straight
 
 
 def test_the_first_and_the_last_pose_alone_are_no_estimate(tmp_path):
@@ -177,8 +188,13 @@ def test_poses_of_another_frame_are_not_compared_as_they_are(tmp_path):
     with pytest.raises(BenchmarkError, match=r"far.tum: lies 2120 km from the truth: poses must be in the tunnel's"):
         score_files(far, truth, alignment="none")
     assert score_files(far, truth)[0].ape < 1e-6
-    lost = write_tum(tmp_path / "lost.tum", time, position + np.array([900.0, 0.0, 0.0]), rotation)
-    assert score_files(lost, truth, alignment="none")[0].along_rms == pytest.approx(900.0)
+    for away in (1990.0, 2010.0):  # 1 km beyond ten times the way
+        lost = write_tum(tmp_path / "lost.tum", time, position + np.array([0.0, 0.0, away]), rotation)
+        if away < 2000.0:
+            assert score_files(lost, truth, alignment="none")[0].up_rms == pytest.approx(away)
+        else:
+            with pytest.raises(BenchmarkError, match="lies 2 km from the truth"):
+                score_files(lost, truth, alignment="none")
 
 
 def test_stamps_between_those_of_the_truth_are_scored_against_the_pose_between(tmp_path):
