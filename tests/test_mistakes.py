@@ -87,28 +87,20 @@ sys.meta_path.insert(0, Blocked())
 """
 
 
-@pytest.mark.parametrize(
-    ("library", "words", "says"),
-    [
-        ("rosbags", "scene.build x --out o", "rosbags is not installed: pip install -e '.[recordings]'"),
-        pytest.param(
-            "orbax", "train --out o", "orbax.checkpoint is not installed", marks=pytest.mark.slow
-        ),
-        pytest.param(
-            "gudhi", "benchmarks.fidelity run", "gudhi is not installed", marks=pytest.mark.slow
-        ),
-        pytest.param(
-            "tensorboardX", "train --tensorboard --out o", "pip install 'subterra-jax[logs]'",
-            marks=pytest.mark.slow,
-        ),
-        pytest.param("viser", "subterra_jax.viewer", "pip install 'subterra-jax[viewer]'", marks=pytest.mark.slow),
-        pytest.param("tyro", "subterra_jax.recorder --out o", "pip install tyro", marks=pytest.mark.slow),
-        pytest.param(
-            "rosbags", "subterra_jax.recorder --out o", "pip install rosbags", marks=pytest.mark.slow
-        ),
-    ],
-)  # fmt: skip
-def test_a_library_that_is_missing_is_named_with_what_brings_it(library, words, says, desk):
+MISSING = {  # command: library that is not there, and what it says
+    "scene.build x --out o": ("rosbags", "rosbags is not installed: pip install -e '.[recordings]'"),
+    "train --out o": ("orbax", "orbax.checkpoint is not installed"),
+    "benchmarks.fidelity run": ("gudhi", "gudhi is not installed"),
+    "train --tensorboard --out o": ("tensorboardX", "pip install 'subterra-jax[logs]'"),
+    "subterra_jax.viewer": ("viser", "pip install 'subterra-jax[viewer]'"),
+    "subterra_jax.recorder --out tyro": ("tyro", "pip install tyro"),
+    "subterra_jax.recorder --out o": ("rosbags", "pip install rosbags"),
+}
+
+
+@pytest.mark.parametrize("words", MISSING)
+def test_a_library_that_is_missing_is_named_with_what_brings_it(words, desk):
+    library, says = MISSING[words]
     (desk / "blocker").mkdir()
     (desk / "blocker" / "sitecustomize.py").write_text(BLOCKER)
     paths = {"PYTHONPATH": f"{desk / 'blocker'}{os.pathsep}{ROOT}", "BLOCKED": library}
