@@ -6,12 +6,13 @@
 import csv
 import os
 from collections.abc import Iterator
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
+from matplotlib.text import Text
 
 _FEW = 6
 _MODEL = (
@@ -100,3 +101,21 @@ def named(tree):
     """Leaves of a tree by their paths."""
     leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
     return {jax.tree_util.keystr(path, simple=True, separator=" "): np.asarray(leaf, float) for path, leaf in leaves}
+
+
+def drawn(figure: Any) -> dict[str, Any]:
+    """What a figure says and where its lines, areas, bars and pictures lie in the units of its axes."""
+    found: dict[str, Any] = {"words": "; ".join(text.get_text() for text in figure.findobj(Text) if text.get_text())}
+    for number, axes in enumerate(figure.axes):
+        parts = [(one.get_transform(), one.get_path()) for one in (*axes.lines, *axes.patches)]
+        parts += [(one.get_transform(), path) for one in axes.collections for path in one.get_paths()]
+        corners = [np.nan_to_num((frame - axes.transData).transform(path.vertices), nan=-99.0) for frame, path in parts]
+        found |= {f"{number} corners": np.concatenate([*corners, np.zeros((0, 2))]), f"{number} limits": axes.axis()}
+        found |= {f"{number} picture {k}": np.nan_to_num(one.get_array()) for k, one in enumerate(axes.images)}
+    return found
+
+
+def lines_of(records: list[Any]) -> str:
+    """Records of measurements as text, without where and when they were measured."""
+    here = {"versions": {}, "date": "", "hardware": "", "commit": ""}
+    return "\n".join(str(replace(record, **here)).removeprefix("Record") for record in records)

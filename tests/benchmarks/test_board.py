@@ -19,7 +19,9 @@ from subterra_jax.baselines import registry
 from subterra_jax.episode import Driver
 from subterra_jax.evaluation import harness
 from subterra_jax.evaluation.floor import floor
+from tests.recorded import check, drawn, lines_of
 
+VALUES = Path(__file__).with_name("values.csv")
 SPLITS = ("val", "test-unseen")
 PLANAR = roster.PLANAR
 
@@ -83,21 +85,32 @@ def test_figures_beyond_a_bound_are_named_and_others_are_not():
     assert above == ["scan-matching, StopAt, cast of val: 100 % is above the ceiling, 50 %"]
 
 
-def test_tables_and_records_hold_every_agent():
-    both = {"splits": SPLITS}
-    some = [cell("fused", 0.4, **both), cell("locate-transformer", 0.7, **both), cell("ceiling", 0.95, **both)]
-    text = tables.as_markdown(some)
-    assert "| *floor* | 30 |" in text
-    assert "| locate-transformer | 70 (" in text
-    assert tables.kinds_markdown(some, "val").splitlines()[0] == "| **StopAt** | cast |"
-    assert "| locate-transformer | 70 |" in tables.kinds_markdown(some, "val")
-    values = {record.id: record.value for record in records_of(some)}
-    assert values["board/StopAt/test-unseen/locate-transformer"] == 70.0
-    assert values["board/StopAt/best/best-written"] == 40.0
-    assert values["board/StopAt/best/floor"] == 30.0
-    (bright,) = records_of([cell("fused", 0.9) | {"texture": 0.5}])
-    assert bright.id == "board/StopAt+texture-0.5/val/fused"
-    assert "--texture 0.5" in bright.command
+def test_pages_records_and_picture_of_a_board_are_those_of_the_table():
+    both, rng = {"splits": SPLITS}, np.random.default_rng(5)
+    names = (
+        "fused",
+        "scan-matching",
+        "locate-transformer",
+        "StopAt-plain",
+        "locate-map",
+        "ceiling",
+        "oracle",
+        "mine.py:Own",
+    )
+    some = [cell(name, 0.1 * k + 0.2, **both) for k, name in enumerate(names)]
+    some += [cell("fused", 0.2, hidden=True, **both), cell("ceiling", 0.3, "Return", splits=("test-unseen",))]
+    some += [cell("fused", 0.9, "Mine/Own-v1", floor=None) | {"texture": 0.5}, cell("random", 0.0, "Return", **both)]
+    for one in some:
+        one["goal_error"] = [None if x < 0.1 else x for x in rng.random(len(one["success"])).round(3).tolist()]
+        one["contact"] = rng.integers(0, 2, len(one["success"])).tolist()
+        one["floor"] = None if one["floor"][0] is None else rng.random(len(one["floor"])).round(3).tolist()
+    some[0]["columns"].append({"kind": "control", "split": OWN})
+    some[0] |= {name: some[0][name] + some[0][name][:40] for name in ("success", "contact", "goal_error")}
+    some[0]["floor"].append(0.25)
+    pages = {"all": tables.as_markdown(some), "none": tables.screen_markdown([cell("fused", 0.4)])}
+    pages |= {split: tables.kinds_markdown(some, split) for split in SPLITS}
+    picture = {split: drawn(tables.draw(some, split)) for split in (*SPLITS, "test-seen")}
+    check(VALUES, "board", {"pages": pages, "picture": picture, "records": lines_of(records_of(some))})
 
 
 def test_the_picture_names_the_best_of_each_group_and_agents_of_ones_own_between_floor_and_ceiling():
@@ -120,13 +133,6 @@ def test_the_best_of_a_group_is_chosen_on_val_and_not_where_it_is_shown():
     agent, score = row["best written"]
     assert (agent, score.success) == ("scan-matching", 0.0)
     assert row["learnt"] is None
-
-
-def test_a_hidden_start_is_a_row_of_its_own():
-    some = [cell("fused", 0.4, splits=SPLITS), cell("fused", 0.2, splits=SPLITS, hidden=True)]
-    lines = tables.screen_markdown(some).splitlines()
-    assert lines[2].startswith("| StopAt | 30 | **40**")
-    assert lines[3].startswith("| StopAt, hidden start | 30 | **20**")
 
 
 def test_a_cell_of_some_of_the_splits_stands_where_it_was_driven():

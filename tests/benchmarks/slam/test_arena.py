@@ -18,6 +18,7 @@ from benchmarks.slam.arena.walls import draw_walls
 from benchmarks.slam.reading import read_samples, sweep_points
 from scene.survey.carrier import ACCEL_BIAS, GRAVITY, Poses
 from scene.survey.cast import Hits
+from tests.recorded import check
 
 # Fields as name, offset, ROS code of the type; and the bytes of a point. Sources: velodyne_pointcloud's
 # pointcloudXYZIRT.cpp; ouster_ros' os_point.h (`ring` is a byte up to 2023, as LIO-SAM and FAST-LIO declare it).
@@ -34,6 +35,7 @@ LIVOX_POINT = [
     ("tag", "uint8"), ("line", "uint8"),
 ]  # fmt: skip
 TOPICS = {"vlp16": "/velodyne_points", "os1-32": "/ouster/points", "avia": "/livox/lidar"}
+VALUES = Path(__file__).with_name("values.csv")
 SEED = np.random.SeedSequence(4)
 
 
@@ -197,14 +199,27 @@ def test_a_drive_rests_first_and_its_imu_then_integrates_to_the_way(motion):
     assert felt == pytest.approx(turn, abs=0.05)
 
 
-@pytest.mark.parametrize(("motion", "place"), [
-    ("trolley", (-1160.189108, -216.157893, -17.717746)), ("walk", (-1160.582133, -217.579758, -17.635487)),
-    ("b2", (-1160.929732, -218.534478, -18.466159)),
-])  # fmt: skip
-def test_nine_seconds_after_its_start_a_drive_is_where_it_was_when_programs_were_scored(motion, place):
-    course = record.Course("one", "smooth", "vlp16", motion, distance=20.0)
-    drive = record.draw_scene(course, np.random.SeedSequence(4)).drive
-    np.testing.assert_allclose(drive.poses(np.array([9.0])).position[0], place, atol=5e-6)
+@pytest.mark.parametrize("name", ["walls-joints", "motion-walk", "motion-b2", "dust-half", "beams-06", "walls-sprayed"])
+def test_a_course_is_what_it_was_when_programs_were_scored(name, tmp_path):
+    config = sets.ArenaConfig(tmp_path, courses=(name,), distance=20.0)
+    scene = record.draw_scene((course := sets.plan_arena(config)[0]), sets.course_seed(config, course))
+    _, time, wheels = record._odometry(scene)
+    bore, poses = scene.drive.bore, scene.drive.poses(time)
+    record.write_truth(scene, tmp_path)
+    node = bore.section.rough(np.arange(20.0, 90.0, 0.37))
+    ray = np.random.default_rng(4).normal(size=(60_000, 3))
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    wall = Hits(*(np.full((len(ray), *more), 3.0, np.float32) for more in ((), (), (), (3,))))
+    dust = record.draw_dust(np.random.default_rng(5), 0.5)(np.random.default_rng(6), ray, wall)
+    told = {"poses": [poses.position, poses.quaternion], "wheels": [wheels.position, wheels.quaternion], "walls": node}
+    told |= {"knots": np.array([*scene.drive.knots, scene.drive.duration, bore.alignment.length])}
+    told |= {"axis": np.loadtxt(tmp_path / "axis.csv", delimiter=",", skiprows=1), "dust": list(vars(dust).values())}
+    told |= {"truth": np.loadtxt(tmp_path / "lidar.tum")[:, :4], "course": (tmp_path / "course.json").read_text()}
+    told |= {
+        "calibration": json.dumps(record.calibration(scene)),
+        "things": json.dumps([one.describe() for one in bore.things]),
+    }
+    check(VALUES, f"course {name}", told, rel=1e-6)
 
 
 def test_wheels_have_one_sign_a_robot_and_the_scale_of_real_corridors():

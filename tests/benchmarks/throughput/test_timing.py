@@ -1,6 +1,7 @@
 """Throughput: what is timed and how, and its command at sizes that say nothing about speed."""
 
 import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +19,9 @@ from benchmarks.throughput.config import ThroughputConfig
 from benchmarks.throughput.loops import Peer, environment_loop, jaxnav_loop, measure_jaxnav
 from benchmarks.throughput.report import Result
 from benchmarks.throughput.timing import Loop, Speed, Timing, digest, measure
+from tests.recorded import check, lines_of
+
+VALUES = Path(__file__).parents[1] / "values.csv"
 
 
 def counting(first: float = 0.0) -> Loop:
@@ -118,19 +122,19 @@ def test_ratios_are_of_medians_at_the_same_size(result):
     assert result.ratios(result.peers[0]) == {16: 4.0}
 
 
-def test_the_tables_hold_speeds_ratios_and_what_was_left_out(result):
-    text = report.as_text(result)
-    for said in ("1.9 k to 2.05 k", "jaxnav, 256: out of memory", "500,000.0", "32 k", "4 at 16", "0 wrong"):
-        assert said in text, said
-
-
-def test_a_record_names_sensor_and_texture_and_how_to_measure_again(result):
-    result.config = ThroughputConfig(n=(16,), sensor="vlp16", texture=0.5, poses=0)
-    result.environment = environment_facts()
-    result.tunnel["tunnels"], result.exactness = 1, None
+def test_the_page_and_the_records_of_a_run_are_those_of_the_table(result):
+    pages = {"one": report.as_text(result)}
+    result.tunnel["tunnels"], result.environment["platform"] = 1, "gpu"
     found = report.records_of(result)
-    assert [record.id for record in found] == ["speed/cpu-vlp16-texture-16", "speed/cpu-vlp16-texture-256"]
-    assert "--sensor vlp16 --texture 0.5 --n 16 --poses 0" in found[0].command
+    result.config = ThroughputConfig(
+        n=(16,), sensor="vlp16", texture=0.5, poses=0, tunnel="open:cast:val:0-1", copies=2
+    )
+    result.speeds += [speed(65_536, 1e9, 2.4e9, 3e9)]
+    pages["several"] = report.as_text(result)
+    found += report.records_of(result)
+    result.environment["platform"], result.tunnel["tunnels"] = "cpu", 4
+    found += report.records_of(result)
+    check(VALUES, "throughput", {"pages": pages, "records": lines_of(found)})
 
 
 def run_here(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
