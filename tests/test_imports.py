@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from tests import conftest
+
 ROOT = Path(__file__).parents[1]
 ROOMS = ("scene", "subterra_jax", "train", "benchmarks", "tests")
 HOST = "subterra_jax.host"  # plumbing without jax, which `scene` may import, and nothing else of `subterra_jax`
@@ -99,3 +101,11 @@ def test_no_two_files_import_each_other() -> None:
     late = "def f():\n    from room.a import g"  # wherever the import stands
     one = {"room.a": "import room.b", "room.b": "from room import c", "room.c": late}
     assert circles(one) == [{"room.a", "room.b", "room.c"}]
+
+
+def test_what_the_list_of_slow_tests_names_is_there():
+    lines = [line for line in conftest.SLOW.read_text().splitlines() if not line.startswith("#")]
+    assert lines == sorted(set(lines))
+    for line in lines:
+        file, _, name = line.partition("[")[0].partition("::")
+        assert f"def {name}" in (ROOT / file).read_text(), line

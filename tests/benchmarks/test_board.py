@@ -113,18 +113,6 @@ def test_pages_records_and_picture_of_a_board_are_those_of_the_table():
     check(VALUES, "board", {"pages": pages, "picture": picture, "records": lines_of(records_of(some))})
 
 
-def test_the_picture_names_the_best_of_each_group_and_agents_of_ones_own_between_floor_and_ceiling():
-    success = {"fused": 0.4, "scan-matching": 0.5, "locate-transformer": 0.7, "locate-map": 0.9, "mine.py:Own": 0.1}
-    some = [cell(name, value, splits=SPLITS) for name, value in {**success, "oracle": 1.0, "ceiling": 0.95}.items()]
-    (axes,) = tables.draw(some).axes
-    band = axes.collections[0].get_datalim(axes.transData)
-    assert (band.x0, band.x1) == pytest.approx((30.0, 95.0))
-    best = ["50  scan-matching", "70  locate-transformer", "90  locate-map", "10  mine.py:Own"]
-    assert [text.get_text() for text in axes.texts] == ["floor 30", "ceiling 95", *best]
-    handles, groups = axes.get_legend_handles_labels()
-    assert len(set(groups)) == len({handle[0].get_marker() for handle in handles}) == 4
-
-
 def test_the_best_of_a_group_is_chosen_on_val_and_not_where_it_is_shown():
     good_on_val, good_on_test = cell("scan-matching", 0.0, splits=SPLITS), cell("fused", 0.0, splits=SPLITS)
     good_on_val["success"] = [1] * 40 + [0] * 40

@@ -115,44 +115,23 @@ def test_a_command_that_fails_is_told_by_the_last_line_of_its_log(tmp_path):
     assert run_module("json.tool", tmp_path / "one.json", log=tmp_path / "log.txt").message == ""
 
 
-def write_case(folder, shift=(0.0, 0.0, 0.0), width=5.65, end=40.0):
-    """A straight bore along x, and its truth; the bore shifted and sized as asked."""
-    station = np.arange(0.0, 40.01, 0.25)
-    position = np.column_stack([station, np.zeros((len(station), 2))])
-    truth = {
-        "schema": "subterra.truth/1",
-        "station": station.tolist(),
-        "position": (position + np.array([100.0, 50.0, 7.0])).tolist(),
-        "width": [5.65] * len(station),
-        "height": [6.36] * len(station),
-    }
-    (folder / "truth.json").write_text(json.dumps(truth))
-    bore_station = np.arange(0.0, end + 0.01, 0.25)
-    bore = np.column_stack([bore_station, np.zeros((len(bore_station), 2))]) + shift
-    np.savez(
-        folder / "bore.npz",
-        station=bore_station,
-        position=bore,
-        width=np.full(len(bore_station), width),
-        height=np.full(len(bore_station), 6.36),
-    )
-    (folder / "manifest.json").write_text(json.dumps({"frame": {"origin": [100.0, 50.0, 7.0]}}))
-    return load_truth(folder / "truth.json")
-
-
-def test_a_perfect_bore_has_no_error(tmp_path):
-    figures = compare(tmp_path, write_case(tmp_path)).figures()
-    assert all(abs(value) < 1e-3 for value in figures.values()), figures
-
-
-def test_a_shifted_wider_longer_bore_is_off_by_just_that(tmp_path):
-    truth = write_case(tmp_path, shift=(0, 0.03, -0.04), width=5.70, end=41.0)
-    comparison = compare(tmp_path, truth)
-    assert comparison.figures()["centreline_rmse"] == pytest.approx(0.05, abs=1e-4)
-    assert comparison.lateral.mean() == pytest.approx(0.03, abs=1e-4)
-    assert comparison.vertical.mean() == pytest.approx(-0.04, abs=1e-4)
-    assert comparison.figures()["width_rmse"] == pytest.approx(0.05, abs=1e-4)
-    assert comparison.length_error == pytest.approx(1.0, abs=1e-6)
+@pytest.mark.parametrize(("shift", "wider", "longer"), [((0.0, 0.0, 0.0), 0.0, 0.0), ((0.0, 0.03, -0.04), 0.05, 1.0)])
+def test_a_shifted_wider_longer_bore_is_off_by_just_that(tmp_path, shift, wider, longer):
+    station, origin = np.arange(0.0, 40.01, 0.25), [100.0, 50.0, 7.0]
+    sizes = {"station": station.tolist(), "width": [5.65] * len(station), "height": [6.36] * len(station)}
+    place = lambda along: np.column_stack([along, np.zeros((len(along), 2))])  # noqa: E731
+    truth = {"schema": "subterra.truth/1", **sizes, "position": (place(station) + origin).tolist()}
+    (tmp_path / "truth.json").write_text(json.dumps(truth))
+    (tmp_path / "manifest.json").write_text(json.dumps({"frame": {"origin": origin}}))
+    along = np.arange(0.0, 40.01 + longer, 0.25)
+    size = {"width": np.full(len(along), 5.65 + wider), "height": np.full(len(along), 6.36)}
+    np.savez(tmp_path / "bore.npz", station=along, position=place(along) + shift, **size)
+    found = compare(tmp_path, load_truth(tmp_path / "truth.json"))
+    figures = found.figures()
+    assert [*figures] == ["centreline_rmse", "width_rmse", "height_rmse", "length_error"]
+    np.testing.assert_allclose([*figures.values()], [np.hypot(*shift[1:]), wider, 0.0, longer], atol=1e-4)
+    np.testing.assert_allclose(found.lateral, shift[1], atol=1e-4)
+    np.testing.assert_allclose(found.vertical, shift[2], atol=1e-4)
 
 
 def test_a_file_of_another_schema_is_refused(tmp_path):

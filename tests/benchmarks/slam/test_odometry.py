@@ -10,72 +10,16 @@ from scipy.spatial.transform import Rotation
 from benchmarks.command import BenchmarkError
 from benchmarks.slam import odometry
 from benchmarks.slam.arena import record
+from benchmarks.slam.arena.drives import REST, ramp_up
 from benchmarks.slam.reading import DOPPLER_POINT
 from scene.survey.bore import draw_bore
-from scene.survey.carrier import Carried
-from scene.survey.cast import Caster, Face, sweeps
-from scene.survey.config import SensorErrors
+from scene.survey.cast import Face
 from scene.survey.mesh import Part
 from subterra_jax.host.texture import brightness, wall_angle
 from tests.recorded import check
 
 SEED = np.random.SeedSequence(4)
 VALUES = Path(__file__).with_name("values.csv")
-KEPT = 34  # sweeps of the rest that tests leave out
-
-
-def drawn(texture, doppler=False, distance=3.0):
-    return record.draw_scene(record.Course("one", "smooth", distance=distance, texture=texture, doppler=doppler), SEED)
-
-
-def points_of(sweep):
-    points = np.zeros(int(sweep.valid.sum()), DOPPLER_POINT)
-    points["x"], points["y"], points["z"] = sweep.points[sweep.valid].T
-    points["intensity"], points["t"] = sweep.reflectivity[sweep.valid], sweep.offset[sweep.valid]
-    if sweep.velocity is not None:
-        points["velocity"] = sweep.velocity[sweep.valid]
-    return points
-
-
-def unrolled(texture):
-    """By cell, the brightness of two sweeps 0.45 m apart at their true places."""
-    scene = drawn(texture)
-    bore, lidar = scene.drive.bore, scene.sensor.lidar
-    face = record.face_of(scene)
-    caster, carried = Caster(bore.mesh(), lidar.range_max), Carried(scene.drive, record._HERE)
-    seen = sweeps(np.random.default_rng(0), lidar, carried, caster, SensorErrors(), every=3, face=face)
-    frames, images = bore.alignment.frames(np.array([scene.drive.begin])), []
-    for sweep in islice(seen, 14, 16):
-        true = carried.poses(1e-9 * (sweep.begin + sweep.offset[sweep.valid]))
-        returns = true.position + Rotation.from_quat(true.quaternion).apply(sweep.points[sweep.valid])
-        placed = (returns - frames.position[0]) @ frames.matrix[0]
-        pose = scene.drive.poses(np.array([1e-9 * sweep.begin + 0.05])).position[0]
-        sensor = (pose - frames.position[0]) @ frames.matrix[0]
-        along, angle, value = odometry.unroll(placed - sensor, sweep.reflectivity[sweep.valid].astype(float))
-        near = (np.abs(along) < 3.0) & (np.abs(np.abs(angle) - 1.5) < 0.35)  # without the floor
-        images.append(by_cell(scene.drive.begin + sensor[0] + along[near], angle[near], value[near]))
-    return images
-
-
-def by_cell(station, angle, value):
-    cell = np.stack([np.floor(station / 0.05), np.floor(angle * 2.8 / 0.05)], axis=1).astype(int)
-    keys, where = np.unique(cell, axis=0, return_inverse=True)
-    mean = np.bincount(where.ravel(), value) / np.bincount(where.ravel())
-    return dict(zip(map(tuple, keys.tolist()), mean, strict=True))
-
-
-def likeness(one, other):
-    both = sorted(one.keys() & other.keys())
-    assert len(both) > 300
-    return np.corrcoef([one[k] for k in both], [other[k] for k in both])[0, 1]
-
-
-def test_two_sweeps_of_a_bag_have_the_wall_in_common_by_the_dial():
-    found = [likeness(*unrolled(texture)) for texture in (0.0, 0.25, 1.0)]
-    print("correlation by dial", np.round(found, 3))
-    assert found[0] <= 0.05
-    assert found[2] >= 0.6
-    assert found[0] < found[1] < found[2]
 
 
 def test_brightness_of_the_survey_is_that_of_station_and_angle_in_a_bend():
@@ -89,15 +33,15 @@ def test_brightness_of_the_survey_is_that_of_station_and_angle_in_a_bend():
     np.testing.assert_array_equal(face(25.0, points, np.full(3, Part.RAIL)), 1.0)
 
 
-def advance(step, scene, skip=KEPT):
-    """The step over the moving part of a drive; what of the way it lost."""
-    seen = islice(record.cast_sweeps(scene), skip, None)
-    way = [step(points_of(sweep), Rotation.identity(), np.zeros(3)) for sweep in seen]
-    return abs((way[-1] - way[0])[0] - scene.course.distance) / scene.course.distance  # ahead is forward
-
-
-def test_doppler_gives_the_way_where_walls_are_smooth():
-    assert advance(odometry.by_doppler(), drawn(0.0, doppler=True), 28) < 0.01
+def test_a_sweep_shows_the_face_of_the_wall_and_the_speed_of_each_return():
+    scene = record.draw_scene(record.Course("one", "smooth", distance=9.0, texture=1.0, doppler=True), SEED)
+    sweep = next(islice(record.cast_sweeps(scene), 40, None))
+    seen, speeds = sweep.points[sweep.valid], sweep.velocity[sweep.valid]
+    ahead = seen[:, 0] / np.linalg.norm(seen, axis=1)
+    speed = 1.5 * ramp_up(np.array([4.05]), REST, 2.0)[0]
+    assert -np.polyfit(ahead, speeds, 1)[0] == pytest.approx(speed, rel=0.02)
+    np.testing.assert_allclose(speeds, -speed * ahead, atol=0.25)
+    check(VALUES, "sweep", {"bright": sweep.reflectivity, "speeds": sweep.velocity, "valid": sweep.valid}, rel=1e-3)
 
 
 RATE, BIAS = np.array([0.0, 0.0, 0.12]), np.array([0.01, -0.02, 0.03])  # rad/s
