@@ -69,7 +69,7 @@ def advance_odometry(
     period: Float[Array, ""],
     noise: Float[Array, "n"],
     params: OdometryParams,
-    backward: Bool[Array, ""] | bool = False,
+    backward: Bool[Array, ""],
 ) -> OdometryState:
     """Add the measured motion of one step.
 

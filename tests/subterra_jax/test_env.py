@@ -108,6 +108,7 @@ def test_an_episode_is_what_it_was(task, request):
     noted = {name: np.stack([info[name] for info in infos[1:]]) for name in infos[1]}
     space, known = env.observation_space(params), env.privileged(state, params)
     assert all(((obs >= space.low) & (obs <= space.high)).all() for obs in flat)
+    assert space.contains(space.low) & space.contains(space.high)
     here = params.tunnel.pick(state.tunnel)
     known |= {"way": env.rule.shortest_way(state, here, params), "least": env.rule.least_length(params)}
     told = {"sensed": sensed, "reward": np.stack(rewards), "info": noted, "state": named(state), "known": known}

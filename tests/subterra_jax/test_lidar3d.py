@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 
@@ -303,3 +304,6 @@ def test_a_sensor_in_a_recess_is_free_and_one_in_the_wall_beside_it_is_not(bend,
     lidar3d.require_free(reliefs["bend"], at(turn), axis["station"][row])
     with pytest.raises(st.SubterraError, match=r"the sensor at .* is inside the wall, or in a thing"):
         lidar3d.require_free(reliefs["bend"], at(turn + 0.6), axis["station"][row])
+    for x, y, z, free in ((20.0, 0.5, -1.0, False), (19.7, 0.5, -1.0, True), (20.0, 0.5, -0.65, True)):  # in the box?
+        with nullcontext() if free else pytest.raises(st.SubterraError, match="in a thing"):
+            lidar3d.require_free(reliefs["things"], (x, y, z), 20.0)

@@ -53,6 +53,7 @@ def test_the_size_of_the_steps_does_not_matter_to_a_wandering_error():
         many = slip.advance_wander(many, jnp.float32(-3.0), jnp.float32(0.0), PARAMS)
     np.testing.assert_allclose(many, one, rtol=1e-5)
     assert slip.advance_wander(jnp.float32(0.02), jnp.float32(0.0), jnp.float32(5.0), PARAMS) == jnp.float32(0.02)
+    assert np.isfinite(jax.grad(slip.advance_wander, 1)(jnp.float32(0.02), jnp.float32(0.0), jnp.float32(5.0), PARAMS))
     # As the filters have it: after a long way nothing is left of it, and its size is what it was.
     np.testing.assert_allclose(stations._process(PARAMS, jnp.float32(1e6)), [0.0, 4e-4], rtol=1e-6)
 

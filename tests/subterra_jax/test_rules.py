@@ -12,9 +12,11 @@ import pytest
 import subterra_jax as st
 from subterra_jax import tasks
 from subterra_jax.host.task_ids import PLANAR
+from subterra_jax.lidar import LidarParams
 from subterra_jax.params import digest, plain, task_figures
 from subterra_jax.parts.odometer import OdometryParams
 from subterra_jax.parts.slip import SlipParams, WanderParams
+from subterra_jax.parts.unicycle import VehicleParams
 from subterra_jax.procedural import open_world
 from subterra_jax.rules import GoalParams, RewardParams, StartParams
 from tests.recorded import check
@@ -121,7 +123,8 @@ def test_privileged_state_tells_what_observations_do_not():
 def test_a_task_that_cannot_be_is_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         st.make("Subterra/StopAtShort-v1", **arguments)
-    st.make("Subterra/StopAtShort-v1", tunnel=st.tunnel.from_centreline([[0.0, 0.0], [90.0, 0.0]], 2.5))  # just so long
+    least = {"lidar": LidarParams(n_beams=1), "vehicle": VehicleParams(radius=0.8, speed_max=6.0)}  # just so long
+    st.make("Subterra/StopAtShort-v1", tunnel=st.tunnel.from_centreline([[0.0, 0.0], [90.0, 0.0]], 2.5), **least)
 
 
 HIDDEN_START_SIGMA = 3.0

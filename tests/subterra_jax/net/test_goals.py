@@ -250,13 +250,3 @@ def test_the_evaluation_gives_an_agent_what_it_declares_and_no_more(name):
 def test_the_recorder_gives_an_agent_what_it_declares_and_no_more(name, tmp_path):
     trace = record(RecorderConfig(out=tmp_path / "one", task="TraverseShort", agent=probe(name), steps=3))
     np.testing.assert_allclose(trace.command[:, 0], PROBES[name][1], rtol=1e-4)
-
-
-def test_the_truth_that_is_handed_out_is_the_truth():
-    id = "Subterra/StopAt-v1"
-    env, params, *_ = robots.made(id)
-    state, _ = robots.driven(id, robots.fresh(id, 50), 50)
-    true = robots.known(env, state, params)
-    np.testing.assert_array_equal(true["station"], state.station)
-    np.testing.assert_allclose(true["to_goal"], state.goal.station - state.station, atol=1e-4)
-    assert set(env.fields(params)) == {"ranges", "odometry", "goal", "ring_pitch", "start"}
