@@ -11,7 +11,7 @@ from scene.fitting.evidence import Holes, more_than_chance, odds_by_place, pocke
 from scene.fitting.section import Sections
 from scene.fitting.unroll import Grid
 from tests.scene.clouds import curved_d_bore
-from tests.scene.fits import fitted, thin
+from tests.scene.fits import fitted, keep, thin
 from tests.scene.railway import World, arch, stations, terrestrial
 from tests.scene.shapes import PLACE
 from tests.scene.test_lining import DEPTH, HALF, JOINTS, LENGTH, OFFSET, RADIUS, ROWS
@@ -38,6 +38,7 @@ def strewn() -> np.ndarray:
 def test_no_ring_and_no_pocket_is_measured_where_there_is_none(cloud, line, monkeypatch):
     thinned = thin(cloud())
     sections = fitted(thinned, line)[1]
+    keep(sections)
     found, joints = pockets.find_pockets(sections)
     assert len(found) == len(joints) == 0
     monkeypatch.setattr(evidence, "open_rims", lambda deficit, grid, row, *rest: np.zeros(len(row)))
@@ -189,6 +190,7 @@ def test_the_ratio_is_the_odds_that_a_hole_is_a_pocket(left, behind) -> None:
     sections, holes, kind = drawn(7, left, behind)
     faint = kind > 0
     ratio, pocket = pocket_over_wall(sections, holes, SIZE)[faint], kind[faint] == 1
+    keep(ratio)
     chance = 1 / (1 + np.exp(-ratio))
     for low, high in ((0.0, 0.1), (0.1, 0.3), (0.3, 0.7), (0.7, 0.9), (0.9, 1.0)):
         some = (chance > low) & (chance <= high)
@@ -208,6 +210,7 @@ def test_holes_are_what_most_others_at_their_place_in_the_ring_are() -> None:
     station = np.concatenate([ring + 0.01, ring + 0.8, [31.49, 30.8, 30.4, 31.2]])
     ratio = np.concatenate([np.full(20, 9.0), np.full(20, -9.0), [0.0, 0.0, 0.0, 1.0]])
     odds = odds_by_place(ratio, station, 1.5)
+    keep(odds)
     assert odds[40] == pytest.approx(np.log(21 / 0.5), abs=0.1)  # across the end of a ring from twenty pockets
     assert odds[41] == pytest.approx(-odds[40], abs=0.1)
     assert odds[42] == pytest.approx(0.0, abs=1e-9)  # alone

@@ -20,7 +20,9 @@ ORIENTATION = (0.4, 0.1)
 
 
 def cleaned(points: np.ndarray) -> Cleaned:
-    return fits.cleaned(thin(points))
+    result = fits.cleaned(thin(points))
+    fits.keep(fits.told(result))
+    return result
 
 
 def arch(*others: Tube | Box) -> np.ndarray:
@@ -194,6 +196,7 @@ def test_a_wall_unseen_beside_a_train_goes_on_as_before_and_behind():
     field[30:80, 10:50] = np.nan
     field[5, 5] = np.nan
     filled = fill_holes(field, 4.0)
+    fits.keep(filled)
     assert np.abs(filled - seen)[30:80, 10:50].max() < 0.03
     assert np.isnan(filled[5, 5])  # small holes are filled from all around
     assert np.nanmax(np.abs(fill_nearest(field) - seen)) > 0.2  # which would bulge here
@@ -209,6 +212,7 @@ def test_a_widening_of_a_lay_bys_length_is_bore_and_a_niche_is_not(length, out, 
     radius = np.where(beside, out, 2.75) + rng.normal(0.0, 0.01, len(station))
     around = Around(station, radius * np.cos(angle), radius * np.sin(angle))
     tube = measure_tube(around, np.ones(len(station)), 90.0, np.full(72, 8.0))
+    fits.keep([tube.wall, tube.usual, tube.matched, tube.closed])
     row = round((45.0 - tube.grid.start) / tube.grid.step)
     wall = float(np.median(tube.wall[row - 2 : row + 3][:, np.abs(tube.grid.angle) < 0.3]))
     assert wall == pytest.approx(out if bore else 2.75, abs=0.15)
@@ -267,7 +271,9 @@ JUNCTIONS = {
 
 def bore_of(points: np.ndarray) -> Bore:
     result = cleaned(points)
-    return fits.bore_about(result.axis, result.cloud)
+    bore = fits.bore_about(result.axis, result.cloud)
+    fits.keep(bore, " bore")
+    return bore
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from scene.errors import Cause
 from scene.fitting.axis import CentrelineConfig
 from scene.fitting.section import fit_unfolded
 from scene.judging.judge import JudgingConfig, judge_bore
-from tests.scene.fits import thin
+from tests.scene.fits import keep, thin, told
 
 Span = tuple[float, float]
 Thing = tuple[Span, Span, Span]  # along the corridor, across it, and above its floor, m
@@ -108,6 +108,7 @@ def built(things: list[Thing], recesses: tuple[Thing, ...] = ()) -> tuple[Bore, 
     cleaned = clean_cloud(cloud, CentrelineConfig())
     _, bore = fit_unfolded(cleaned.cloud, cleaned.axis, 12.0, cleaned.behind)
     judgement = judge_bore(bore, cloud, JudgingConfig(), cause=cleaned.cause)
+    keep({"cleaned": told(cleaned), "bore": bore, "judgement": judgement.facts})
     surface = (bore.surface() + cloud.origin - PLACE) @ _TURN.T  # station, left of the middle, above the floor, m
     return bore, cleaned, surface, any(warning.refuses for warning in judgement.warnings)
 

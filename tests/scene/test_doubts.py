@@ -19,6 +19,7 @@ from scene.judging.page import render_page
 from scene.judging.sanity import doubt_bore, doubt_layers
 from tests.scene.clouds import curved_d_bore
 from tests.scene.conftest import arc_bore
+from tests.scene.fits import keep
 from tests.scene.test_judging import about, block, cloud_of, on_wall
 
 METRES = {"unit": "m (detected: least extent 6)", "axes": "xyz (by default, z up)"}
@@ -148,6 +149,7 @@ def test_a_build_prints_and_writes_its_judgement(with_vehicle, tmp_path, capsys)
     assert "track: none: the survey shows no rails; --track standard lays one" in shown.out
     manifest = json.loads((out / "manifest.json").read_text())
     judgement = manifest["judgement"]
+    keep({part: manifest[part] for part in ("detected", "judgement", "count", "bore", "provenance")})
     assert 0.0 < judgement["share"]["explained"] < 1.0
     for warning in judgement["warnings"]:
         assert f"warning: {warning['text']} [{warning['code']}]" in shown.err

@@ -7,7 +7,7 @@ from scene.bore import Bore
 from scene.fitting import floor
 from scene.fitting.section import fit_sections
 from tests.scene import railway
-from tests.scene.fits import fitted, straight, thin
+from tests.scene.fits import fitted, keep, straight, thin
 from tests.scene.railway import World, arch
 from tests.scene.shapes import PLACE
 
@@ -59,6 +59,7 @@ SLOW = pytest.mark.slow
 )
 def test_floor_and_height_are_right_under_track_and_beside_walkways(world, sensor):
     bore, error = built(world, SCANS[sensor](world), 0.07 if sensor == "terrestrial" else 0.04)
+    keep(bore)
     within = slice(8, -8)  # a carried scanner sees no floor at a mouth
     assert np.abs(error[within]).max() < 0.03
     assert np.median(bore.height) == pytest.approx(world.outline[:, 1].max(), abs=0.03)
@@ -79,7 +80,9 @@ def test_a_thin_cloud_shows_the_floor_between_sleepers_in_longer_windows(monkeyp
     world = World(arch(5.1, 5.5, 3.0), L, PROUD)
     points = SCANS["terrestrial"](world)
     thin = points[np.random.default_rng(3).permutation(len(points))[:5_000]]  # 10 a square metre
-    assert np.abs(built(world, thin, 0.07)[1][8:-8]).max() < 0.03
+    bore, error = built(world, thin, 0.07)
+    keep(bore)
+    assert np.abs(error[8:-8]).max() < 0.03
     monkeypatch.setattr(floor, "_LONGEST_WINDOW", 0.0)
     assert np.abs(built(world, thin, 0.07)[1][8:-8]).max() > 0.05
 
@@ -90,7 +93,9 @@ def test_ghosts_of_a_walker_do_not_lift_the_floor():
     count = int(0.12 * len(points))
     x = rng.uniform(0, L, count)
     ghosts = np.column_stack([x, rng.normal(0, 0.25, count), rng.uniform(0.1, 1.8, count) + 0.01 * x]) + PLACE
-    assert np.abs(built(world, np.concatenate([points, ghosts]), 0.04)[1]).max() < 0.03
+    bore, error = built(world, np.concatenate([points, ghosts]), 0.04)
+    keep(bore)
+    assert np.abs(error).max() < 0.03
 
 
 def test_the_floor_runs_on_straight_under_a_train_and_through_a_gap():
@@ -100,7 +105,9 @@ def test_the_floor_runs_on_straight_under_a_train_and_through_a_gap():
         train.scan(railway.terrestrial(), beside, 0.004),
         SCANS["terrestrial"](World(arch(5.5, 6.0, 3.2), 40.0, hole=(14.0, 24.0))),
     ):
-        assert np.abs(built(train, points, 0.07)[1]).max() < 0.05
+        bore, error = built(train, points, 0.07)
+        keep(bore, f" {len(points)}")
+        assert np.abs(error).max() < 0.05
 
 
 def test_a_walkway_stays_beside_the_floor_and_what_stands_there_for_a_metre_goes():
@@ -123,7 +130,9 @@ def test_a_round_invert_is_no_floor():
     turn = np.linspace(-np.pi, np.pi, 200)[:-1]
     tube = World(np.column_stack([2.7 * np.cos(turn), 2.7 + 2.7 * np.sin(turn)]), L)
     cloud = thin(SCANS["vlp16"](tube))
-    assert not fit_sections(cloud, straight(cloud, tube.middle)).flat_floor
+    sections = fit_sections(cloud, straight(cloud, tube.middle))
+    keep(sections)
+    assert not sections.flat_floor
 
 
 @pytest.mark.parametrize(("plateau", "lower"), [(0.0, False), (0.02, False), (0.22, True)])
@@ -157,6 +166,7 @@ def test_the_floor_goes_on_beside_a_pit_and_is_not_guessed_across_it(monkeypatch
         true = -2.8 + 0.04 * np.sin(2 * np.pi * floors.station / 25.0)
         return float(np.abs(floors.height - true)[inner].max())
 
+    keep(floor.find_floors(*points, 0.0, 60.0))
     assert worst() < 0.01
     monkeypatch.setattr(floor, "_lines_beside_pit", lambda *_: [])
     assert worst() > 0.03

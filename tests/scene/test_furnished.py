@@ -14,6 +14,7 @@ from scene.writing.mjcf import SceneConfig, add_lights, concrete_picture
 from scene.writing.track import TrackConfig, lay_track
 from subterra_jax.host.tunnelfile import read_fields
 from tests.scene.conftest import arc_bore
+from tests.scene.fits import keep
 
 WITH_DOOR = FurnitureConfig(passage_spacing=20.0, plate_spacing=6.0)
 
@@ -83,6 +84,9 @@ def test_pieces_have_their_sizes_and_lamps_hang_4_cm_under_the_crown(level, laid
 
 
 def test_every_kind_can_be_left_out(level, laid):
+    whole = furnish_bore(level, laid, WITH_DOOR)
+    keep([planar_segments(whole.items, level, laid.elevation, 0.7), whole.bore, *whole.niche_corners])
+    keep([[item.corners() for item in whole.items], count_items(whole.items)], " items")
     kinds = {"walkway", "handrail", "cables", "third_rail", "plates", "passage", "lamps"}
     none = FurnitureConfig(**dict.fromkeys(kinds, False))
     nothing = furnish_bore(level, laid, none)

@@ -8,6 +8,7 @@ from scene.cloud import Cloud
 from scene.errors import Cause, Code
 from scene.judging.judge import Judgement, JudgingConfig, judge_bore
 from scene.judging.places import BEHIND, BEYOND, EXPLAINED, INSIDE, TrackZone, compare_returns, wall_radius
+from tests.scene.fits import keep
 
 FLOOR = -3.2
 
@@ -107,6 +108,7 @@ THINGS = {
 def test_a_thing_is_found_where_it_is_and_named(bore, wall, name):
     (station, lateral, upward), side = THINGS[name]
     judgement = judge_bore(bore, cloud_of(wall, block(bore, station, lateral, upward)), JudgingConfig())
+    keep(judgement.facts)
     largest = judgement.places[0]
     assert largest.start == pytest.approx(station[0], abs=0.5)
     assert largest.end == pytest.approx(station[1], abs=0.5)
@@ -121,7 +123,9 @@ def judged_without(bore: Bore, hide) -> Judgement:
     """Judgement of returns on the whole wall but those that `hide` takes, by station, lateral and upward offset."""
     wall = on_wall(bore)
     seen = ~hide(*wall)
-    return judge_bore(bore, cloud_of(about(bore, *(v[seen] for v in wall))), JudgingConfig())
+    judgement = judge_bore(bore, cloud_of(about(bore, *(v[seen] for v in wall))), JudgingConfig())
+    keep(judgement.facts)
+    return judgement
 
 
 def test_an_unseen_wall_is_named_with_its_side_and_its_stations(bore):
@@ -164,7 +168,9 @@ def test_a_lining_that_goes_on_beyond_an_end_is_told_and_a_cutting_is_not(bore, 
     radius = wall_radius(bore, before, angle)
     kept = overhead | (radius * np.sin(angle) < 0.5)  # floor and foot of the walls alone
     more = about(bore, before[kept], (radius * np.cos(angle))[kept], (radius * np.sin(angle))[kept])
-    warnings = judge_bore(bore, cloud_of(wall, more), JudgingConfig()).warnings
+    judgement = judge_bore(bore, cloud_of(wall, more), JudgingConfig())
+    keep(judgement.facts)
+    warnings = judgement.warnings
     outcome = [warning.text for warning in warnings if warning.code == "cut_short"]
     assert bool(outcome) == said
     assert not said or "goes on for at least 7 m before station 0 m" in outcome[0]

@@ -14,7 +14,7 @@ from scene.fitting.section import fit_unfolded
 from scene.fitting.unroll import fill_sides
 from scene.geometry import axis_through
 from tests.scene import railway
-from tests.scene.fits import Line, bore_about, fitted, thin
+from tests.scene.fits import Line, bore_about, fitted, keep, thin
 from tests.scene.railway import World, arch
 from tests.scene.shapes import PLACE, midline, swept
 
@@ -60,6 +60,7 @@ def with_nails():
 
 def test_pockets_are_measured_with_place_size_and_depth(with_nails):
     bore, provenance, _ = with_nails
+    keep([bore, provenance])
     assert provenance["pockets"] == provenance["rings"] == "measured"
     assert len(bore.pocket) == pytest.approx(2 * len(JOINTS) * len(ROWS), rel=0.06)
     assert bore.pocket["measured"].all()
@@ -93,12 +94,14 @@ def test_every_pocket_is_joined_to_the_next_of_its_joint(bore):
 def test_empty_pockets_have_no_nails():
     bore, provenance, _ = built(lined(nails=False), line=LINE)
     assert provenance["pockets"] == "measured"
+    keep(bore)
     assert provenance["nails"] == "none found"
     assert not len(bore.nail)
 
 
 def test_a_smooth_wall_seen_well_gets_nothing():
     bore, provenance, _ = built(swept("circle", 18, yaw=0.4, per_metre=9000), line=midline("circle", 18, yaw=0.4))
+    keep(bore)
     assert set(provenance.values()) == {"none found"}
     assert not len(bore.pocket)
     assert not len(bore.ring_station)
@@ -108,6 +111,7 @@ def test_a_wall_seen_too_thinly_gets_the_standard_lining_on_request_marked_so(tm
     points = swept("circle", 30, yaw=0.4)
     sparse, line = points[::8], midline("circle", 30, yaw=0.4)
     bore, provenance, _ = built(sparse, LiningConfig(lay="standard"), line)
+    keep(bore)
     assert provenance == {"rings": "by standard", "pockets": "by standard", "nails": "by standard"}
     assert len(bore.pocket) == 2 * 8 * len(bore.ring_station)
     assert len(bore.nail) == 8 * len(bore.ring_station)
@@ -189,6 +193,7 @@ def test_the_bore_keeps_its_width_where_a_scan_ends_aslant(monkeypatch):
     def off() -> float:
         return float(np.abs(fitted(cloud, ARCH.middle)[0].width - 5.5).max())
 
+    keep(fitted(cloud, ARCH.middle))
     assert off() < 0.03
     monkeypatch.setattr(section, "_GOES_ON", 0.0)
     assert off() > 0.2
@@ -202,6 +207,7 @@ def test_a_wall_that_nobody_saw_stands_straight_between_crown_and_floor(monkeypa
     def width() -> np.ndarray:
         return fitted(cloud, ARCH.middle)[0].width[8:-8]
 
+    keep(width())
     assert np.abs(width() - 5.5).max() < 0.10
     monkeypatch.setattr(section, "fill_sides", lambda wall, angle, reach: wall)
     assert np.median(width()) > 6.0
@@ -215,6 +221,7 @@ def test_an_axis_that_bends_so_sharply_that_sections_fold_is_smoothed():
     axis = axis_through(path, 0.25)
     assert bore_about(axis, cloud).find_fold() is not None
     _, bore = fit_unfolded(cloud, axis, 12.0)
+    keep(bore)
     assert bore.find_fold() is None
     assert np.abs(bore.axis.curvature).max() < 0.3
     assert np.median(bore.width) == pytest.approx(5.5, abs=0.05)

@@ -17,6 +17,7 @@ from scene.progress import Stages
 from scene.reading.formats import ReadingConfig
 from scene.reading.recording import Recording
 from tests.scene.bags import write_bag
+from tests.scene.fits import keep
 
 RATE, COUNT, RAYS = 10.0, 90, 2000
 
@@ -62,6 +63,7 @@ def trajectory(late: float = 0.0, turn: tuple[float, float, float] = (0.0, 0.0, 
 
 def test_right_poses_leave_walls_as_thin_as_a_sweep_does(recording):
     check = check_poses(recording, trajectory())
+    keep(check.facts, rel=1e-3)
     assert not check.blurred
     assert check.words is None
     assert check.facts["pose_doubt"] is None
@@ -78,6 +80,7 @@ WRONG = {
 def test_a_wrong_clock_and_a_wrong_mount_are_named(recording, name, bore):
     poses, said = WRONG[name]
     check = check_poses(recording, poses)
+    keep(check.facts, rel=1e-3)
     assert check.blurred
     assert said in check.words
     warnings = doubt_bore(bore, check.facts, {}, surveyed=True)

@@ -15,7 +15,7 @@ from scene.fitting.section import visible_span
 from scene.fitting.unroll import Grid
 from scene.geometry import Around, axis_through
 from tests.scene.clouds import KnownBore, curved_d_bore
-from tests.scene.fits import cleaned, rebuilt, thin
+from tests.scene.fits import cleaned, keep, rebuilt, thin
 from tests.scene.shapes import PLACE, midline, outline, swept
 
 STRAIGHT = np.array([[0.0] * 3, [30.0, 0.0, 0.0]])
@@ -31,6 +31,7 @@ def offsets(bore: Bore, cloud: Cloud, known: KnownBore) -> tuple[np.ndarray, np.
 def test_a_curved_d_bore_is_measured_in_any_orientation(yaw):
     known = curved_d_bore(yaw=yaw, per_metre=2000)
     bore, cloud = rebuilt(known.points)
+    keep(bore)
     lateral, vertical = offsets(bore, cloud, known)
     assert np.sqrt(np.mean(lateral**2)) < 0.01
     assert np.sqrt(np.mean(vertical**2)) < 0.01
@@ -49,6 +50,7 @@ def test_a_hole_in_the_survey_is_filled_and_marked():
     known = curved_d_bore(length=30, radius=1e6, grade=0.0, yaw=0.0, offset=(0, 0, 0))
     gone = (np.abs(known.points[:, 0] - 15) < 0.4) & (known.points[:, 2] > -2.5)
     bore, _ = rebuilt(known.points[~gone], STRAIGHT)
+    keep(bore)
     at_hole = np.abs(bore.position[:, 0] + np.floor(np.median(known.points[:, 0])) - 15) < 0.2
     assert bore.filled[at_hole].all()
     assert np.abs(bore.width[at_hole] - known.width).max() < 0.05
@@ -79,6 +81,7 @@ def with_rails(cloud: np.ndarray, floor: float) -> np.ndarray:
 def test_the_corner_of_wall_and_floor_is_not_cut_off(kind):
     section = outline(kind)
     bore, cloud = rebuilt(with_rails(swept(kind, 24.0, yaw=0.0), section[:, 1].min()), midline(kind, 24.0, yaw=0.0))
+    keep(bore)
     surface = bore.surface()[8:-8] + cloud.origin - PLACE
     wall = np.stack([surface[..., 1], surface[..., 2] - 0.01 * surface[..., 0]], axis=-1).reshape(-1, 2)
     true = LineString(section[np.argsort(np.arctan2(*section.T[::-1]))])
@@ -143,6 +146,7 @@ def test_a_section_that_is_only_begun_at_a_mouth_does_not_bend_the_axis():
     points = np.stack([station, 2.5 * np.cos(angle) + aside, 2.5 * np.sin(angle)], axis=1)[kept]
     axis = axis_through(np.column_stack([np.linspace(0.0, 20.0, 21), np.zeros((21, 2))]), 1.0)
     middles = section_middles(points, axis, lambda at: np.full((len(at.station), 72), 2.5))
+    keep(middles)
     assert np.abs(middles[:, 1]).max() < 0.02
     assert middles[-1, 0] == pytest.approx(20.0, abs=1.01)
 
@@ -179,6 +183,7 @@ def test_the_ceiling_goes_on_behind_what_hangs_under_it(name):
     seen = np.minimum(bare, thing)
     assert (bare - seen).max() > 0.4
     bridged = bridge_hanging(np.stack([bare, seen]), ANGLE)
+    keep(bridged)
     np.testing.assert_array_equal(bridged[0], bare)
     np.testing.assert_allclose(bridged[1], bare, atol=0.12)  # the line cuts a round crown's arc off
 

@@ -19,7 +19,7 @@ from scene.writing.track import TrackConfig, describe_track, lay_track, track_pr
 from subterra_jax.physics.ground import read_track
 from subterra_jax.tunnel.sources import load_tunnel
 from tests.scene import railway
-from tests.scene.fits import fitted, thin
+from tests.scene.fits import fitted, keep, thin
 from tests.scene.railway import World, arch
 from tests.scene.shapes import PLACE
 
@@ -81,11 +81,13 @@ def f1(bore: Bore, cloud: Cloud, stations: np.ndarray) -> float:
 def test_proud_sleepers_and_the_gauge_are_found(name, sensor, gauge):
     cloud, bore = scanned(name, sensor)
     (line,) = seen_in(name, sensor).lines
+    keep(line)
     assert line.rails.measured
     assert line.rails.gauge == pytest.approx(gauge, abs=0.005)
     assert line.sleepers.protrusion == pytest.approx(0.24 if name == "ballast" else 0.22, abs=0.015)
     assert f1(bore, cloud, line.sleepers.station) >= 0.9
     laid = lay_track(bore, TrackConfig(), SeenTrack((line,), True))
+    keep(laid, " laid")
     assert laid.lines[0].gauge == line.rails.gauge
     assert describe_track(laid, SeenTrack((line,), True))["gauge_seen"] == line.rails.gauge
 
@@ -97,6 +99,7 @@ def test_two_tracks_are_two_and_a_gauge_that_no_face_shows_is_not_seen():
     assert all(f1(bore, cloud, line.sleepers.station) >= 0.9 for line in seen.lines)
     laid = lay_track(bore, TrackConfig(), seen)
     facts = describe_track(laid, seen)
+    keep([seen, laid, facts])
     assert [line["gauge_seen"] for line in facts["lines"]] == [None, None]
     assert [line["gauge_from"] for line in facts["lines"]] == ["by standard"] * 2
     assert facts["gauge"] == 1.435
@@ -106,6 +109,7 @@ def test_two_tracks_are_two_and_a_gauge_that_no_face_shows_is_not_seen():
 def test_no_railway_is_found_where_there_is_none(name):
     _, bore = scanned(name, "terrestrial")
     seen = seen_in(name, "terrestrial")
+    keep([seen, lay_track(bore, TrackConfig(lay="standard"), seen)])
     assert not seen.lines
     laid = lay_track(bore, TrackConfig(), seen)
     assert not laid.lines
@@ -116,6 +120,7 @@ def test_no_railway_is_found_where_there_is_none(name):
 def test_cant_is_measured():
     _, bore = scanned("canted")
     (line,) = seen_in("canted").lines
+    keep([line, lay_track(bore, TrackConfig(), seen_in("canted"))])
     turned = 1 if bore.tangent[0, 0] > 0 else -1  # left is the other side for who goes back
     assert np.median(line.rails.cant) == pytest.approx(turned * 0.08, abs=0.01)
 
@@ -135,6 +140,7 @@ def test_rails_on_a_bare_floor_get_no_sleepers_and_the_robot_drives_on_the_floor
     _, bore = scanned("bare rails")
     seen = seen_in("bare rails")
     laid = lay_track(bore, TrackConfig(), seen)
+    keep([seen, laid])
     assert len(laid.lines) == 1
     assert not len(laid.sleeper_station)
     np.testing.assert_array_equal(laid.elevation, laid.bed)
@@ -203,6 +209,7 @@ def test_sleepers_of_uneven_pitch_are_not_filled_up():
     world = replace(WORLDS["proud"], boxes=[*railway.sleepers(uneven + 0.3, 0.22), *railway.rails(L, 0.23)])
     cloud = thin(world.scan(railway.os1(), railway.carried(L, 1.4, 0.5), 0.012))
     (line,) = find_track(cloud, bore).lines
+    keep(line)
     inside = (uneven + 0.3 < L).sum()
     assert abs(len(line.sleepers.station) - inside) <= 2
 
@@ -238,6 +245,7 @@ def test_a_gauge_between_faces_that_poses_blur_is_not_measured(blur, seed, unask
     station, lateral, height, upward = low_points("proud")
     blurred = lateral + np.random.default_rng(seed).normal(0.0, blur, len(lateral))
     (line,) = rails_seen.find_rails(rails_seen.LowPoints(station, blurred, height, upward))
+    keep(line)
     assert not line.measured
     for limit in unasked:
         monkeypatch.setattr(rails_seen, limit, 1.0)
@@ -251,6 +259,7 @@ def test_rails_that_poses_broaden_are_found_and_have_no_gauge(blur, monkeypatch)
     station, lateral, height, upward = low_points("double")
     blurred = lateral + np.random.default_rng(2).normal(0.0, blur, len(lateral))
     tracks = rails_seen.find_rails(rails_seen.LowPoints(station, blurred, height, upward))
+    keep(tracks)
     assert [float(np.median(one.offset)) for one in tracks] == pytest.approx([-2.1, 2.1], abs=0.02)
     assert not any(one.measured for one in tracks)
     monkeypatch.setattr(rails_seen, "_NARROW", (9,))
@@ -290,6 +299,7 @@ def test_few_or_blurred_returns_leave_the_gauge_as_it_was(simulated):
     found = simulated.found
     rails = found.seen.lines[0].rails
     low = above_floor(found.cloud.points.astype(np.float64), found.bore)
+    keep(measure_again(rails, low))
     assert measure_again(rails, low).gauge != rails.gauge
     blurred = low.lateral + np.random.default_rng(1).normal(0.0, 0.012, len(low.lateral))
     assert measure_again(rails, low._replace(lateral=blurred)) is rails

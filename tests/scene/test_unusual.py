@@ -22,6 +22,7 @@ from scene.reading.recording import Recording
 from tests.scene.bags import write_imu_bag
 from tests.scene.conventions import OFFSET, RAYS, sweeps, write_convention
 from tests.scene.files import CLOUDS
+from tests.scene.fits import keep
 from tests.scene.messages import PLAIN, POINTCLOUD2, pointcloud2, write_bag1
 from tests.scene.test_odd_inputs import WKT
 
@@ -103,6 +104,7 @@ def test_sweeps_of_another_driver_are_read_as_they_were_measured(tmp_path, name)
     with Recording(write_sweeps(tmp_path / "a.bag", how)) as recording:
         scans = list(recording.scans())
     assert how.said in recording.facts["point_times"]
+    keep([recording.facts, [scan.stamp - HEADERS[0] for scan in scans], [scan.times for scan in scans]])
     assert len(scans) == how.count
     shift = [scan.stamp - start for scan, (start, _, _) in zip(scans, sweeps(how.count), strict=True)]
     assert np.ptp(shift) < 0.02  # one clock for all of them, whatever its beginning

@@ -21,6 +21,7 @@ from scene.writing.planar import cut_walls
 from scene.writing.track import TrackConfig, lay_track
 from scene.writing.trackgeoms import fastening_mesh, nail_mesh
 from tests.scene.conftest import arc_bore
+from tests.scene.fits import keep
 
 
 def irregular(bore: Bore) -> Bore:
@@ -250,6 +251,7 @@ def test_sleepers_between_seen_rails_that_would_meet_a_wall_are_left_out_and_tol
     assert line.left_out == inside.sum() > 5
     assert line.clearance.min() >= TrackConfig().margin
     (warning,) = doubt_track(laid, seen)
+    keep([laid, warning])
     assert warning.text.startswith(f"{line.left_out} sleepers are left out")
     whole = lay_track(bore, TrackConfig(), seen)
     assert whole.lines[0].left_out == 0
