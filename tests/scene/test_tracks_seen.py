@@ -169,13 +169,6 @@ def test_the_user_may_want_none_or_the_standard_and_rings_show_none():
         assert track_provenance(standard, shown)["sleepers"] == "by standard"
 
 
-def test_a_face_read_a_centimetre_off_is_no_gauge(monkeypatch):
-    cloud, bore = scanned("proud")
-    monkeypatch.setattr(rails_seen, "_FACE", (0.06, 0.12))  # the web in place of the head's side
-    (line,) = find_track(cloud, bore).lines
-    assert not (line.rails.measured and abs(line.rails.gauge - 1.435) < 0.005)
-
-
 @pytest.mark.parametrize("name", ["road", pytest.param("double", marks=pytest.mark.slow)])
 def test_what_is_written_agrees_and_a_scene_without_track_loads(name, tmp_path):
     _, bore = scanned(name, "terrestrial")
@@ -237,33 +230,23 @@ def test_sleepers_that_nobody_saw_are_said_to_stand_by_the_spacing():
     assert doubt_track(asked, unseen) == doubt_track(lay_track(bore, TrackConfig(), None), SeenTrack()) == []
 
 
-@pytest.mark.parametrize(
-    ("blur", "seed", "unasked", "narrow"),
-    [(0.012, 1, ("_FACE_SHARP", "_HEAD_SHARP"), 0.005), (0.027, 4, ("_HEAD_SHARP",), 0.015)],
-)
-def test_a_gauge_between_faces_that_poses_blur_is_not_measured(blur, seed, unasked, narrow, monkeypatch):
+@pytest.mark.parametrize(("blur", "seed"), [(0.012, 1), (0.027, 4)])
+def test_a_gauge_between_faces_that_poses_blur_is_not_measured(blur, seed):
     station, lateral, height, upward = low_points("proud")
     blurred = lateral + np.random.default_rng(seed).normal(0.0, blur, len(lateral))
     (line,) = rails_seen.find_rails(rails_seen.LowPoints(station, blurred, height, upward))
     keep(line)
-    assert not line.measured
-    for limit in unasked:
-        monkeypatch.setattr(rails_seen, limit, 1.0)
-    (line,) = rails_seen.find_rails(rails_seen.LowPoints(station, blurred, height, upward))
-    assert line.measured  # all pieces agree, on too little
-    assert line.gauge < 1.435 - narrow
+    assert not line.measured  # though all pieces agree, on too little
 
 
 @pytest.mark.parametrize("blur", [0.03, 0.04])
-def test_rails_that_poses_broaden_are_found_and_have_no_gauge(blur, monkeypatch):
+def test_rails_that_poses_broaden_are_found_and_have_no_gauge(blur):
     station, lateral, height, upward = low_points("double")
     blurred = lateral + np.random.default_rng(2).normal(0.0, blur, len(lateral))
     tracks = rails_seen.find_rails(rails_seen.LowPoints(station, blurred, height, upward))
     keep(tracks)
     assert [float(np.median(one.offset)) for one in tracks] == pytest.approx([-2.1, 2.1], abs=0.02)
     assert not any(one.measured for one in tracks)
-    monkeypatch.setattr(rails_seen, "_NARROW", (9,))
-    assert not rails_seen.find_rails(rails_seen.LowPoints(station, blurred, height, upward))
 
 
 def test_a_cloud_too_thin_to_show_rails_or_blurred_by_its_poses_says_so():
@@ -277,11 +260,6 @@ def test_a_cloud_too_thin_to_show_rails_or_blurred_by_its_poses_says_so():
     assert "no rails were seen, but poses blur the walls" in warned.text
     shown = seen_in("proud")
     assert doubt_track(lay_track(scanned("proud")[1], TrackConfig(), shown), shown, "poses blur the walls") == []
-
-
-def test_three_pieces_of_which_two_agree_by_chance_make_no_gauge():
-    gauges = np.array([1.4105, 1.4233, 1.4234])
-    assert rails_seen._robust_spread(gauges) > rails_seen._STRETCHES_AGREE
 
 
 def test_single_returns_show_a_gauge_that_means_of_voxels_widen(simulated):

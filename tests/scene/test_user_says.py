@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from scene.build import reconstruct
-from scene.cleaning.clean import ExtentConfig, crop_cloud, parse_box
+from scene.cleaning.clean import crop_cloud, parse_box
 from scene.cloud import Cloud
 from scene.config import ReconstructConfig
 from scene.errors import FitError, RecordingError, Refusal
@@ -12,29 +12,10 @@ from scene.progress import Stages
 from scene.reading.cloudfile import read_cloud
 from scene.reading.formats import ReadingConfig, detect
 from scene.reading.ringsurvey import read_ring_survey
-from scene.writing.folder import Reconstruction
 from tests.scene.clouds import curved_d_bore
 from tests.scene.files import write_e57, write_las, write_ply, write_text
 
 KNOWN = curved_d_bore(length=24, per_metre=4000, offset=(12.0, -3.0, 2.0))
-
-
-def rebuilt(path, **extent) -> Reconstruction:
-    with Stages() as progress:
-        return reconstruct(path, None, ReconstructConfig(extent=ExtentConfig(**extent)), progress)
-
-
-@pytest.fixture(scope="module")
-def whole(bore_file):
-    return rebuilt(bore_file)
-
-
-def test_reverse_counts_from_the_other_end(bore_file, whole):
-    turned = rebuilt(bore_file, reverse=True)
-    np.testing.assert_allclose(
-        turned.bore.position[0] + turned.origin, whole.bore.position[-1] + whole.origin, atol=0.06
-    )
-    assert turned.facts["stations_grow"].startswith("against this, by --reverse")
 
 
 def test_a_box_keeps_what_is_inside_it_in_the_frame_of_the_input():

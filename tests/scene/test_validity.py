@@ -173,10 +173,6 @@ def test_a_ball_moved_to_the_wall_stops_within_3_cm_of_the_mesh(built):
     assert error.max() < 0.03
 
 
-def test_sleepers_stand_every_60_cm_from_end_to_end():
-    assert len(lay_track(arc_bore(length=60.0), TrackConfig()).sleeper_station) == 101
-
-
 def test_the_gauge_is_between_the_inner_faces_of_the_heads(bore, arc_scene):
     """Seen by rays in the compiled scene, 16 mm below the rail top; rail centres 1.435 m apart would give 1.362 m."""
     folder, laid, _ = arc_scene
