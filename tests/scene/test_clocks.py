@@ -140,12 +140,3 @@ def test_headers_at_the_end_of_their_sweeps_are_told_by_the_turns_where_nothing_
     assert (recording.late == 0.0) == ended
     assert clock.offset == pytest.approx(0.0 if ended else -0.1, abs=0.006)
     assert (clock.words is None) == ended
-
-
-@pytest.mark.parametrize("late", [0.3, -0.3])
-def test_a_clock_that_is_off_is_set_right_and_not_doubled(lidar, monkeypatch, late):
-    monkeypatch.setattr(clocks, "lidar_turns", lambda recording: lidar)
-    poses = Trajectory(AT + late, np.zeros((len(AT), 3)), attitude(AT), "poses")
-    clock, moved = settle(Beside(), poses, True)
-    assert clock.offset == pytest.approx(late, abs=0.006)
-    np.testing.assert_allclose(moved.times, AT, atol=0.006)

@@ -54,8 +54,7 @@ def test_the_side_and_the_tolerance_decide(bore, outward, kind):
     angle = np.full(50, 2.0)
     station = np.linspace(1.6, 20, 50)
     radius = wall_radius(bore, station, angle)
-    normal = 2.8 / np.sqrt(2.8**2)  # the crown is an arc about the axis, so its normal is the radius
-    points = about(bore, station, (radius + outward * normal) * np.cos(angle), (radius + outward) * np.sin(angle))
+    points = about(bore, station, (radius + outward) * np.cos(angle), (radius + outward) * np.sin(angle))
     assert (compare_returns(bore, cloud_of(points), 0.10).kind == kind).all()
 
 
