@@ -23,12 +23,10 @@ from tests.subterra_jax.placing import for_nvidia
 
 RADIUS, LENGTH = 2.0, 60.0
 N_SCANS, N_BEAMS = 32, 16
-TRACES = []
 
 
 @jax.jit
 def device_cast(relief, origin, direction, station, range_max):
-    TRACES.append(1)
     return jax.vmap(surfaces.ranges, (None, 0, 0, 0, None))(relief, origin, direction, station, range_max)
 
 
@@ -137,16 +135,6 @@ def test_a_rough_bend_with_recesses_agrees_with_brute_force_over_every_triangle(
     assert np.median(error) < 1e-5
     assert error.max() < 1e-3
     assert (ranges > 15.0).sum() > 20
-
-
-def test_reliefs_of_the_same_sizes_share_one_program(reliefs):
-    way = np.tile(beams.planar(N_BEAMS), (1, 1, 1))
-    cast(reliefs["tube"], [30.0, 0.0, 0.0], way)
-    before, programs = len(TRACES), device_cast._cache_size()
-    for name, x in (("things", 12.0), ("bend", 7.0), ("tube", 31.0)):
-        cast(reliefs[name], [x, 0.1, 0.1], way, range_max=20.0)
-    assert len(TRACES) == before
-    assert device_cast._cache_size() == programs
 
 
 def test_a_pose_that_is_no_number_ends_and_gives_no_number(reliefs):

@@ -66,7 +66,12 @@ def test_the_next_stretch_is_made_before_the_robot_sees_the_end(plan):
 
 @pytest.mark.parametrize(
     ("name", "lining", "begin", "end"),
-    [("metro", "furnished", 100.0, 108.0), ("open:val:0", None, 0.0, 20.0), ("open:cast:val:1", "smooth", 10.0, 19.0)],
+    [
+        ("metro", "furnished", 100.0, 108.0),
+        ("subterra-351", "pockets", 100.0, 105.0),
+        ("open:val:0", None, 0.0, 20.0),
+        ("open:cast:val:1", "smooth", 10.0, 19.0),
+    ],
 )
 def test_a_stage_holds_what_it_held(name, lining, begin, end):
     plan = st.load_tunnel(name, solid=name != "open:val:0")
@@ -95,6 +100,11 @@ def test_walls_goal_beams_and_robot_are_seen_from_above_where_they_are():
     state = state.replace(goal=state.goal.replace(station=np.float32(43.1)))
     obs = env.observe(state, env.draw_step(jax.random.key(0), (), params), params)
     picture = make_view("top").picture(env, params, state, np.asarray(obs))
+    walls = drawing.wall_points(params.tunnel, int(params.tunnel.scan_first[160]), step=0.04)
+    for side in (2.5, -2.5):
+        along = np.sort(walls[np.abs(walls[:, 1] - side) < 1e-4, 0])
+        assert np.diff(along).max() < 0.0401
+        assert np.ptp(along) > 60.0
     expected = {
         drawing.WALL: (-12.0, 12.0, -2.5, 2.5), drawing.GOAL: (3.1, 3.1, -2.5, 2.5),
         drawing.ROBOT: (-0.4, 0.8, -0.4, 0.4), drawing.BEAM: (-12.0, 12.0, -2.5, 2.5),
