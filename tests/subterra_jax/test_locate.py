@@ -149,6 +149,9 @@ def test_another_number_of_beams_or_another_control_period_is_named():
     ):
         with pytest.raises(PolicyError, match=sentence):
             check_fits(agent, env, other, agent.name)
+    read = dataclasses.replace(agent, conditions=dataclasses.replace(agent.conditions, fields=("odometry", "ranges")))
+    with pytest.raises(PolicyError, match=r"one: trained on the fields odometry, ranges; .* has ranges, odom"):
+        check_fits(read, env, params, agent.name)
 
 
 def _way(ways, driven, direction, flagged, now, params):

@@ -1,6 +1,7 @@
 """Pictures without a scene: surfaces lie where the tunnel is, face the camera, and the robot stands in them whole."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import mujoco
@@ -10,6 +11,11 @@ from scipy.spatial import KDTree
 
 import subterra_jax as st
 from subterra_jax.host.texture import brightness, wall_angle
+from subterra_jax.physics.engine import Engine
+from subterra_jax.physics.ground import read_track
+from subterra_jax.physics.rolling import ROVER
+from subterra_jax.physics.view import RobotView
+from subterra_jax.pictures import camera
 from subterra_jax.pictures import top_down as drawing
 from subterra_jax.pictures.camera import TunnelChoice
 from subterra_jax.pictures.renderer import light_near
@@ -91,6 +97,34 @@ def test_the_seven_nearest_lamps_burn_and_the_carrier_is_what_it_was(plan):
     add_carrier(scene, np.array([1.0, 2.0, 3.0]), 0.3, 0.1, 0.4, 0.7)
     geoms = scene.geoms[: scene.ngeom]
     check(TABLE, "carrier", {k: np.stack([getattr(geom, k) for geom in geoms]) for k in ("pos", "mat", "size", "rgba")})
+
+
+class Unseen:
+    """A renderer without OpenGL: its picture is what MuJoCo would draw, and from where."""
+
+    def __init__(self, model, *_size):
+        self.model, self.scene = model, mujoco.MjvScene(model, 4000)
+
+    def update_scene(self, data, seen):
+        every, option = mujoco.mjtCatBit.mjCAT_ALL, mujoco.MjvOption()
+        mujoco.mjv_updateScene(self.model, data, option, None, seen, every, self.scene)
+        self.seen = [np.copy(seen.lookat), seen.distance, seen.azimuth, seen.elevation, self.model.light_active]
+
+    def render(self):
+        drawn = self.scene.geoms[: self.scene.ngeom][-30:]
+        rows = [np.hstack([geom.pos - self.seen[0], geom.size, geom.rgba, geom.mat.ravel()]) for geom in drawn]
+        return SimpleNamespace(copy=lambda: {"camera": self.seen, "parts": list(np.transpose(rows))})
+
+
+def test_a_camera_behind_a_robot_sees_what_it_saw(plan, monkeypatch):
+    monkeypatch.setattr(camera, "open_renderer", Unseen)
+    choice, place = TunnelChoice(plan, "pockets", (100.0, 300.0), texture=0.5), plan.stretch((100.0, 300.0)).centre[400]
+    view, params = make_view("mujoco", choice), SimpleNamespace(vehicle=SimpleNamespace(radius=0.4))
+    state = SimpleNamespace(position=place + 0.3, heading=2.8, tunnel=0)
+    check(TABLE, "camera behind a carrier", view.picture(None, params, state, None))
+    robot = RobotView(Engine(ROVER), read_track(plan), choice)
+    pose = np.array([*place, 1.5, 0.9, 0.1, -0.1, 0.4, 0.1, 0.2, 0.3, 0.4][: 7 + 4])
+    check(TABLE, "camera behind a rover", robot.draw(pose))
 
 
 def test_walls_goal_beams_and_robot_are_seen_from_above_where_they_are():

@@ -27,12 +27,12 @@ WAYS = {  # length of the tunnel (m), task, and what is not its own
 }
 AGENTS = (
     *(("Return", name, 200) for name in ("fused", "scan-matching", "Return-locate", "Return-v1")),
-    *(("Stop", name, 12) for name in ("histogram-filter", "StopAt-v1")),
+    *(("Stop", name, 12) for name in ("histogram-filter", "StopAt-v1", "fused", "dead-reckoning")),
     *(("Hidden", name, 3) for name in ("ceiling", "particle-filter")),  # then rounding draws other particles
     ("Hidden", "locate-map", 150),
     ("Report", "histogram-filter", 12),
     ("Faults", "ceiling", 3),
-    *(("Faults", name, 12) for name in ("oracle", "random", "locate-obstructed")),
+    *(("Faults", name, 12) for name in ("oracle", "random", "fused", "locate-obstructed")),
 )
 TURN = range(120, 141)  # steps of half a turn
 

@@ -12,6 +12,7 @@ import zstandard
 import subterra_jax as st
 from subterra_jax.b2.constants import HIP_X, STAND_HEIGHT
 from subterra_jax.b2.kinematics import standing_pose
+from subterra_jax.baselines.particle import particle_filter
 from subterra_jax.baselines.registry import make_agent
 from subterra_jax.evaluation import Episodes, evaluate
 from subterra_jax.recorder.trace import drive, reckon
@@ -118,7 +119,7 @@ def test_furniture_stands_on_the_ground_where_it_is(plan_of):
 def test_an_episode_is_the_one_that_the_evaluation_drives_and_is_drawn_where_it_was(plan_of):
     plan = plan_of(tunnels.tunnel_arrays(tunnels.straight(30.0)))
     env, params = st.make("Subterra/Traverse-v1", tunnel=plan, lining="smooth")
-    agent, one = make_agent("dead-reckoning", params), np.zeros(1, np.int32)
+    agent, one = particle_filter(params, 600), np.zeros(1, np.int32)
     record = evaluate(env, params, agent, Episodes(np.array([5], np.uint32), one, one, one))
     trace = drive(env, params, agent, 5)
     assert (trace.success, trace.contact) == (record.success[0], record.contact[0])
@@ -130,7 +131,9 @@ def test_an_episode_is_the_one_that_the_evaluation_drives_and_is_drawn_where_it_
     np.testing.assert_allclose(drawn.estimate[-1, 0] - drawn.truth[-1, 0], record.axial_final[0], atol=1e-3)
     assert np.isnan(drawn.estimate[0, 0])
     rows = {name: np.asarray(one)[:20] for name, one in vars(drawn).items() if isinstance(one, np.ndarray)}
-    check(__file__, "drawn", {**rows, "ellipse": drawn.ellipse(10), "gate": drawn.gate()}, 1e-3)
+    check(
+        __file__, "drawn", {**rows, "ellipse": drawn.ellipse(10), "gate": drawn.gate(), "cloud": trace.cloud[:2]}, 1e-3
+    )
     cos, sin = np.cos(drawn.heading[:, None]), np.sin(drawn.heading[:, None])
     across = drawn.truth[:, None, 1] + sin * drawn.hits[..., 0] + cos * drawn.hits[..., 1]
     seen = np.isfinite(across)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
+from tests.recorded import check
 from tests.train.conftest import weights_of
 from train import checkpoint, curve, folder, session, sinks, snapshot
 from train.checkpoint import CheckpointError
@@ -265,6 +266,7 @@ def test_the_table_of_seeds_has_a_line_each_and_their_mean_and_spread(tmp_path, 
     assert outcome["steps"] == pytest.approx([2000.0, 1000.0 * np.sqrt(2.0)])
     assert outcome["seconds_compiled"] == pytest.approx([15.0, 10.0 * np.sqrt(2.0)])
     assert outcome["episodes"] == [120.0, 0.0]
+    check(__file__, "seeds", {"text": (tmp_path / "out" / "seeds.json").read_text().replace(str(tmp_path), "")})
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= 80
     cells = {line.split()[1]: line.replace("│", " ").split()[1:] for line in lines if line.startswith("│")}

@@ -19,8 +19,7 @@ from train.config import TrainConfig
 from train.driver import Driver, Policy
 from train.policies import begin_with, make_agent
 from train.rollout import begin, collect
-from train.setup import make_layout, make_learner
-from train.world import open_world
+from train.setup import make_layout
 
 N_STEPS = 4
 GOAL_TASKS = ("StopAtShort-v1", "Return-v1", "Obstructed-v1", "Faulted-v1")
@@ -149,31 +148,6 @@ def test_a_localiser_counts_the_way_back_from_where_the_robot_has_turned(tunnel,
         state, kept = step(state, kept, command, jax.random.key(k))
     assert kept.located.direction == -1.0
     assert float(kept.located.station.station - state.station) == pytest.approx(0.0, abs=0.25)
-
-
-def test_a_filter_on_the_map_reports_what_it_believes_in_training_as_in_driving():
-    world = open_world("Relocalise-v1", "open:straight:train:2")
-    config = TrainConfig(memory="map", map_cell=1.0, n_envs=4, unroll=6, minibatches=2, hidden=(8,))
-    learner = make_learner(world, config)
-    env, params, driver = world.env, world.params, learner.driver
-    assert (driver.layout.shape.n_action, env.action_size) == (2, 5)
-    policy = Policy(weights_of(driver, 0))
-    agent = make_agent(driver, policy).with_map(params)
-    policies.check_fits(agent, env, params, "mine")
-
-    @jax.jit
-    def answers(params, policy):
-        first = begin(env, driver, policy, params, jax.random.PRNGKey(1), 2)
-        state = jax.tree.map(lambda leaf: leaf[0], first.env_state)
-        obs = observed(env, params, env.observe(state, env.draw_step(jax.random.PRNGKey(5), (), params), params))
-        outcome, _ = agent.act(None, agent.begin(None, obs, params), obs, params, None)
-        return driver.act(jnp.zeros((2, 2)), first.kept, params), outcome
-
-    action, outcome = answers(params, policy)
-    assert action.shape == (2, 5)
-    assert jnp.exp(outcome[3]) > 5.0  # one scan does not tell the place
-    assert 0.0 < outcome[2] < params.tunnel.length
-    np.testing.assert_allclose(jnp.exp(action[0, 3]), jnp.exp(outcome[3]), rtol=0.5)
 
 
 def test_a_localiser_drives_in_training_as_in_an_agent(plan):

@@ -43,14 +43,8 @@ def random_rollout(rng, n_steps=40, n_envs=7):
     terminated, truncated = rng.random((n_steps, n_envs)) < 0.1, rng.random((n_steps, n_envs)) < 0.1
     assert (terminated & truncated).any()
     assert (truncated & ~terminated).any()
-    return (
-        normal(n_steps, n_envs),
-        normal(n_steps, n_envs),
-        normal(n_envs),
-        normal(n_steps, n_envs),
-        terminated,
-        truncated,
-    )
+    shapes = ((n_steps, n_envs), (n_steps, n_envs), (n_envs,), (n_steps, n_envs))
+    return *(normal(*shape) for shape in shapes), terminated, truncated
 
 
 def test_advantages_equal_the_definition_with_both_ends_of_an_episode():

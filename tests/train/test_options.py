@@ -180,22 +180,9 @@ def test_weights_and_biases_gets_every_number_at_its_step(tmp_path, monkeypatch)
     assert sinks.NO_LOGS.open(tmp_path, 0, {}) == []
 
 
-WRONG = {
-    "steps": 0,
-    "n_envs": 0,
-    "unroll": -1,
-    "minibatches": 7,
-    "hidden": (),
-    "frames": 0,
-    "seed": -1,
-    "learning_rate": 0.0,
-    "init_std": 0.0,
-    "discount": 1.5,
-    "gae_lambda": -0.1,
-    "last_std": 0.0,
-    "clip": float("nan"),
-    "entropy_weight": -1.0,
-}
+NOTHING = dict.fromkeys(("steps", "n_envs", "frames", "learning_rate", "init_std", "last_std"), 0)
+BEYOND = {"unroll": -1, "minibatches": 7, "seed": -1, "discount": 1.5, "gae_lambda": -0.1, "entropy_weight": -1.0}
+WRONG = {**NOTHING, **BEYOND, "hidden": (), "clip": float("nan")}
 
 
 @pytest.mark.parametrize("name", WRONG)

@@ -135,30 +135,6 @@ def test_a_localiser_begins_from_a_policy_that_has_none_and_drives_as_it_does(tm
     np.testing.assert_allclose(after.mean, before.mean, atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("conditions", "message"),
-    [
-        ({"period": 0.05}, r"mine: trained with a control period of 0\.05 s, Subterra/TraverseShort-v1 has 0\.1 s"),
-        ({"period": 0.1, "n_beams": 24}, "mine: trained with 24 beams, Subterra/TraverseShort-v1 has 16"),
-        (
-            {"period": 0.1, "constants": "0123456789abcdef"},
-            "mine: trained under constants 0123456789ab of Subterra/TraverseShort-v1, which has [0-9a-f]{12} here",
-        ),
-        (
-            {"period": 0.1, "fields": ["odometry", "ranges"]},
-            "mine: trained on the fields odometry, ranges; Subterra/TraverseShort-v1 has ranges, odometry",
-        ),
-    ],
-)
-def test_another_period_beams_and_fields_are_refused_with_both_sides_named(conditions, message):
-    trained_under = policies.Conditions.from_facts({"task": TASK, "trained_under": conditions})
-    env, params = st.make(TASK)
-    driver = Driver(env, make_layout(env, params, TrainConfig(hidden=(4,))))
-    agent = make_agent(driver, Policy(weights_of(driver, 0)), conditions=trained_under)
-    with pytest.raises(policies.PolicyError, match=message):
-        policies.check_fits(agent, env, params, "mine")
-
-
 @pytest.fixture(scope="module")
 def straight_driver():
     """A policy that drives straight on at 1 m/s whatever it sees."""

@@ -33,18 +33,8 @@ def driven(tunnel):
     run = jax.jit(lambda p, d, key: collect(env, driver, policy, p, d, key, N_STEPS))
     middle, first, *_ = run(params, drive, jax.random.PRNGKey(2))
     after, rollout, finished, terms = run(params, middle, jax.random.PRNGKey(3))
-    return {
-        "env": env,
-        "params": params,
-        "driver": driver,
-        "policy": policy,
-        "middle": middle,
-        "first": first,
-        "after": after,
-        "rollout": rollout,
-        "finished": finished,
-        "terms": terms,
-    }
+    made = {"env": env, "params": params, "driver": driver, "policy": policy, "middle": middle}
+    return made | {"first": first, "after": after, "rollout": rollout, "finished": finished, "terms": terms}
 
 
 def test_the_unrolled_network_answers_as_it_did_step_by_step(driven):

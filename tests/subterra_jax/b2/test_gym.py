@@ -17,11 +17,13 @@ import subterra_jax as st
 from subterra_jax.adapters.kernel import pack
 from subterra_jax.b2 import tasks
 from subterra_jax.b2.params import SensorParams
+from subterra_jax.baselines.registry import make_agent
 from subterra_jax.physics.ground import TrackError
 from subterra_jax.physics.rotations import yaw
 from subterra_jax.physics.stage import RobotError
 from subterra_jax.policies import PolicyError
-from tests.recorded import check
+from subterra_jax.recorder.trace import drive as trace_of
+from tests.recorded import check, named
 
 ID = "Subterra/B2Traverse-v1"
 QUIET = {"rate": 0.0, "gravity": 0.0, "angle": 0.0, "speed": 0.0}
@@ -99,6 +101,14 @@ def test_the_same_seed_gives_the_same_walk_and_another_one_another(env):
     np.testing.assert_array_equal(walks[0], walks[1])
     check(__file__, "walk", {"seen": walks[0], "other": walks[2]}, 5e-3)
     assert not np.array_equal(walks[0], walks[2])
+
+
+def test_a_trace_has_the_poses_of_the_legs(plan):
+    env, params = st.make(ID, plan, policy="trot", engine="mujoco")
+    trace = trace_of(env, params, make_agent("dead-reckoning", params), 3, steps=2)
+    assert trace.pose.shape == (3, 10, 19)
+    seen = {"pose": trace.pose[:, :, :3], "joints": trace.pose[:, :, 7:], "seen": trace.observation}
+    check(__file__, "trace", {**seen, "state": named(trace.state)}, 5e-3)
 
 
 def test_a_fall_ends_the_episode_and_is_no_success(env):

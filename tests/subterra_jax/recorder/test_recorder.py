@@ -125,6 +125,10 @@ def test_the_recording_tells_neither_seed_nor_truth(config, trace):
     np.testing.assert_allclose(rows[:, 1:3], trace.state.position, atol=1e-6)
     lidar = np.loadtxt(config.truth_folder / "lidar.tum")
     np.testing.assert_allclose(np.linalg.norm(lidar[:, 1:4] - rows[:, 1:4], axis=1), 0.7, atol=1e-6)
+    axis = np.loadtxt(config.truth_folder / "axis.csv", delimiter=",", skiprows=1)
+    truth = json.loads((config.truth_folder / "truth.json").read_text()) | {"recording_sha256": None}
+    told = {"lidar": lidar[:20], "axis": axis[:50], "facts": {**facts, "versions": None}, "truth": truth}
+    check(__file__, "files", told)
     with Reader(config.truth_folder) as bag:
         assert {connection.topic for connection in bag.connections} == {"/tf", "/truth/odometry"}
 
