@@ -2,12 +2,13 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import trimesh
 
 from benchmarks.fidelity import scoring, table
 from benchmarks.fidelity.case import Case
+from benchmarks.fidelity.faults import Fault, Site, put_in
 from benchmarks.fidelity.registry import Value, compute_metric
 from tests.benchmarks.fidelity import tube
 
@@ -29,32 +30,26 @@ def lasting(make: Callable[..., Case]) -> Callable[..., Case]:
 
 
 @lasting
-def against(right: tube.Tube, heard: bool = False, box: tuple[float, ...] = (), beams: int = 6000, **changes) -> Case:
+def against(
+    right: tube.Tube, heard: bool = False, box: tuple[float, ...] = (), fault: tuple = (), beams: int = 6000, **changes
+) -> Case:
     """A tube with other dimensions judged against a right one; `heard` by its recording alone, of so many beams.
 
-    `box` puts in boxes, each by its size along, left and up and by the station, left and up of its middle.
+    `box` puts in boxes, each by its size along, left and up and by the station, left and up of its middle; `fault` is
+    that of the suite by its kind, size and place.
     """
     if heard:
-        return replace(against(right, False, box, beams, **changes), truth=None, cache={})
+        return replace(against(right, False, box, fault, beams, **changes), truth=None, cache={})
+    if fault:
+        return put_in(Site(against(right, False, box, beams=beams, **changes)), Fault(*fault))
     if box:
         bodies = [tube.box(right, *box[k + 3 : k + 6], box[k : k + 3]) for k in range(0, len(box), 6)]
         return tube.corrupted(against(right, beams=beams, **changes), extra=trimesh.util.concatenate(bodies))
     return tube.case(right, replace(right, **changes), beams=beams)
 
 
-@lasting
-def judged(**changes) -> Case:
-    """The default tube's recording against a tube with other dimensions; without any, against itself."""
-    return tube.case(tube.Tube(), replace(tube.Tube(), **changes), beams=BEAMS)
-
-
-@lasting
-def obstructed(size: float = 0.5) -> Case:
-    """A cube on the floor in the middle of an otherwise right tube, beside the track."""
-    right = judged()
-    box = trimesh.creation.box((size, size, 2.0))
-    box.apply_translation(tube.Tube().point(9.0, 1.9, -1.2)[0])
-    return Case(replace(right.candidate, extra=box), right.hold, None, right.truth)
+judged = partial(against, DEFAULT, beams=BEAMS)  # the default tube's recording, against one of other dimensions
+obstructed = partial(judged, box=(0.5, 0.5, 2.0, 9.0, 1.9, -1.2))  # a cube on the floor beside the track
 
 
 def measure(id: str, case: Case) -> Value:

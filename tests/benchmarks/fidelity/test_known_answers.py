@@ -24,14 +24,6 @@ def test_every_pocket_of_a_true_copy_is_found_and_without_any_their_error_has_fa
     assert measure("lin_pocket_depth_bias", against(PLAIN, depth=0.0)).failed
 
 
-def test_rails_10_cm_farther_out_give_the_footprint_10_cm_more_room() -> None:
-    wider = short(gauge=SHORT.gauge + 0.2)
-    inner = SHORT.gauge / 2
-    assert inner - 0.40 - 0.15 < raw("nav_footprint_margin", short()) < inner - 0.40
-    gain = raw("nav_footprint_margin", wider) - raw("nav_footprint_margin", short())
-    assert gain == pytest.approx(0.1, abs=0.02)
-
-
 def test_a_floor_with_steps_everywhere_has_another_95th_percentile() -> None:
     assert raw("nav_step_p95_err", short()) == 0.0
     blocks = [trimesh.creation.box((0.15, 6.0, 0.12)) for _ in range(12)]

@@ -1,11 +1,8 @@
 """The leak detector finds what it is made for, and nothing in a clean split."""
 
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,24 +18,6 @@ from scene.survey.simulate import simulate
 from tests.benchmarks.fidelity import tube
 
 GOOD = {"c2m_median": Value(0.012)}
-
-
-@contextmanager
-def opened_files() -> Iterator[set[Path]]:
-    """Collects every file that this process opens while the block runs, by the interpreter's audit events."""
-    opened: set[Path] = set()
-    active = [True]
-
-    def hook(event: str, arguments: tuple[Any, ...]) -> None:
-        if active[0] and event == "open" and isinstance(arguments[0], str | bytes):
-            name = arguments[0] if isinstance(arguments[0], str) else arguments[0].decode(errors="replace")
-            opened.add(Path(name).absolute())
-
-    sys.addaudithook(hook)  # cannot be taken away again, hence the switch
-    try:
-        yield opened
-    finally:
-        active[0] = False
 
 
 @pytest.fixture(scope="module")
@@ -89,8 +68,9 @@ def test_a_builder_that_read_the_held_out_recording_is_caught(case: Case) -> Non
 def test_the_builder_opens_only_its_own_recording(tmp_path: Path) -> None:
     simulate(SurveyConfig(out=tmp_path, length=24.0, sensors=("avia", "vlp16"), point_rate=60_000), Console())
     given = tmp_path / "groundtruth.tum"
-    with opened_files() as opened:
-        build(tmp_path / "survey.bag", tmp_path / "scene", given, BuildConfig())
+    opened: set[Path] = set()
+    sys.addaudithook(lambda event, names: opened.add(Path(str(names[0])).absolute()) if event == "open" else None)
+    build(tmp_path / "survey.bag", tmp_path / "scene", given, BuildConfig())
     inside = {
         path.name for path in opened if path.is_relative_to(tmp_path) and not path.is_relative_to(tmp_path / "scene")
     }

@@ -18,23 +18,11 @@ from benchmarks.fidelity.files import FidelityError
 from benchmarks.fidelity.registry import Samples, Value, dump_values, estimate, load_values, mean, number
 from benchmarks.fidelity.table import B, D, Map, P, U, metric
 from tests.benchmarks.fidelity import tube
+from tests.benchmarks.fidelity.test_verdicts import values
 
 HEAD = "from benchmarks.fidelity.faults import fault_kind\nfrom benchmarks.fidelity.table import B, D, P, U, metric\n"
-MISTAKES = {
-    'metric("lin_x", "LNI")(lambda case: 1.0)': "metric 'lin_x': unknown category 'LNI'; choose one of CEN, SEC",
-    'metric("c2m_mean", "C2M")(lambda case: 1.0)': "metric 'c2m_mean': this id is taken",
-    'metric("lin_x", "LIN")(1.0)': "compute must be a function of a Case, got float",
-    'metric("lin_x", "LIN", "D(1)")(lambda case: 1.0)': "'D(1)' is no score map",
-    'metric("lin_x", "LIN", needs="luck")(lambda case: 1.0)': "needs must be hold, truth",
-    'for _ in "ab": metric("lin_x", "LIN")(lambda case: 1.0)': "metric 'lin_x': this id is taken",
-    "undefined": "cannot be run (NameError: name 'undefined' is not defined)",
-    'fault_kind("wall", "mine")(lambda site, fault: site.candidate)': "fault 'wall': this kind is registered twice",
-    'fault_kind("N01", "mine")(lambda site, fault: 1)': "fault 'N01': the name has a slash, or is that of a control",
-    'fault_kind("x", "mine", falls={"LNI": 9.0})(lambda site, fault: 1)': "fault 'x': unknown category 'LNI' in falls",
-    "import": "cannot be run (SyntaxError: ",
-    "exit()": "cannot be run (SystemExit: ",
-    "": "registers neither a metric nor a fault",
-}
+ROWS = Path(__file__).with_name("mistakes.txt").read_text().splitlines()[1:]
+MISTAKES = dict(row.split(" => ") for row in ROWS)
 
 
 @pytest.fixture(autouse=True)
@@ -81,8 +69,7 @@ def test_metrics_are_scored_beside_the_suite_and_leave_it_alone(tmp_path: Path) 
     metric("lin_along", "LIN", of=np.mean, args=(2.0,))(lambda case, k: Samples(k * np.arange(60), np.arange(60.0)))
     metric("sec_broken", "SEC", U(0, 1))(lambda case: 1 / 0)
     case = tube.case(tube.Tube(length=6.0))
-    suite = {id: Value(1.0 if row.map.kind == "P" else row.map.target if row.map.kind == "B" else row.map.good)
-             for id, row in table.load().items()}  # fmt: skip
+    suite = values(1.0)
     judged = judge.make_judgement({"base": suite, "null": suite, "ceiling": suite}, [])
     with_outside = judge.add_outside(judged, case)
     assert with_outside.scored is judged.scored
@@ -126,10 +113,8 @@ def test_a_fault_of_a_file_is_a_control_and_a_ladder_beside_the_suite(tmp_path: 
         moved = np.abs(corrupted.candidate.lining.vertices - case.candidate.lining.vertices).max()
         return reuse | {id: Value(1.0) for id, row in table.load().items() if row.category == "C2M" and moved > 0.02}
 
-    good = {id: Value(1.0 if row.map.kind == "P" else row.map.target if row.map.kind == "B" else row.map.good)
-            for id, row in table.load().items()}  # fmt: skip
-    outcomes = run_jobs(Bench(case, good, compute=compute, more=file), list_jobs(("dent",)), processes=1)
-    rows = judge_outcomes(outcomes, judge.make_judgement({"base": good, "null": good}, []))
+    outcomes = run_jobs(Bench(case, values(1.0), compute=compute, more=file), list_jobs(("dent",)), processes=1)
+    rows = judge_outcomes(outcomes, judge.make_judgement({"base": values(1.0), "null": values(1.0)}, []))
     assert [(row["kind"], row["detected"]) for row in rows] == [("outside", False), ("outside", True)]
     assert judge.undetected([row | {"detected": False} for row in rows]) == []
     outside.clear()

@@ -1,62 +1,31 @@
 """References from their files: the truth of a survey, and beams without a return."""
 
-import json
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from benchmarks.fidelity import references
 from benchmarks.fidelity.files import FidelityError
-from benchmarks.fidelity.references import (
-    SILENT_RANGE,
-    TRUTH_SCHEMA,
-    Truth,
-    beam_directions,
-    is_organised,
-    load_truth,
-    organised_scans,
-)
 from scene.reading.times import Convention
 from tests.benchmarks.fidelity import tube
 from tests.benchmarks.fidelity.tube import Tube
-
-HEAD = """ply
-format binary_little_endian 1.0
-element vertex {vertices}
-property double x
-property double y
-property double z
-element face {faces}
-property list uchar int vertex_indices
-property uchar part
-end_header
-"""
-FACE = np.dtype([("count", "u1"), ("index", "<i4", 3), ("part", "u1")])
+from tests.benchmarks.fidelity.tubescene import write_truth
 
 
 @pytest.fixture
-def known() -> Truth:
+def known() -> references.Truth:
     return tube.truth(Tube(length=6.0))
 
 
 @pytest.fixture
-def folder(known: Truth, tmp_path: Path) -> Path:
-    surface = known.surface
-    faces = np.zeros(len(surface.faces), FACE)
-    faces["count"], faces["index"], faces["part"] = 3, surface.faces, known.part
-    head = HEAD.format(vertices=len(surface.vertices), faces=len(faces)).encode()
-    (tmp_path / "truth.ply").write_bytes(
-        head + (surface.vertices + known.origin).astype("<f8").tobytes() + faces.tobytes()
-    )
-    columns = {name: getattr(known, name).tolist() for name in ("station", "tangent", "width", "height")}
-    columns |= {"position": (known.position + known.origin).tolist(), "definitions": {"parts": list(known.parts)}}
-    (tmp_path / "truth.json").write_text(json.dumps({"schema": TRUTH_SCHEMA, **columns, **known.furniture}))
-    return tmp_path
+def folder(known: references.Truth, tmp_path: Path) -> Path:
+    return write_truth(tmp_path, known)
 
 
-def test_a_truth_is_read_as_it_was_written(known: Truth, folder: Path) -> None:
-    read = load_truth(folder, known.origin)
+def test_a_truth_is_read_as_it_was_written(known: references.Truth, folder: Path) -> None:
+    read = references.load_truth(folder, known.origin)
     np.testing.assert_allclose(read.surface.vertices, known.surface.vertices, atol=1e-9)
     np.testing.assert_array_equal(read.surface.faces, known.surface.faces)
     np.testing.assert_array_equal(read.part, known.part)
@@ -65,23 +34,23 @@ def test_a_truth_is_read_as_it_was_written(known: Truth, folder: Path) -> None:
     assert read.furniture["rails"]["gauge"] == pytest.approx(1.435)
 
 
-def test_a_truth_that_is_none_is_refused(known: Truth, folder: Path) -> None:
+def test_a_truth_that_is_none_is_refused(known: references.Truth, folder: Path) -> None:
     path = folder / "truth.json"
     text = path.read_text()
-    for old, new, why in ((TRUTH_SCHEMA, "a/0", "schema is a/0"), (text, "[1]", "list"), (text, text[:99], "char"),
+    for old, new, why in (("subterra.truth/1", "a/0", "is a/0"), (text, "[1]", "list"), (text, text[:99], "char"),
                           ('"width"', '"wide"', "width"), ("0.0,", "", "in length")):  # fmt: skip
         path.write_text(text.replace(old, new, 1))
         with pytest.raises(FidelityError, match=rf"truth\.json: cannot be read with its truth\.ply \(.*{why}"):
-            load_truth(folder, known.origin)
+            references.load_truth(folder, known.origin)
 
 
-def test_a_folder_without_a_surface_has_no_truth(known: Truth, folder: Path) -> None:
+def test_a_folder_without_a_surface_has_no_truth(known: references.Truth, folder: Path) -> None:
     (folder / "truth.ply").write_text("ply")
     with pytest.raises(FidelityError, match="cannot be read"):
-        load_truth(folder, known.origin)
+        references.load_truth(folder, known.origin)
     (folder / "truth.ply").unlink()
     with pytest.raises(FidelityError, match=r"holds no truth\.json with its truth\.ply"):
-        load_truth(folder, known.origin)
+        references.load_truth(folder, known.origin)
 
 
 POINT = np.dtype({
@@ -130,7 +99,7 @@ def recording(points, height=RINGS):
 @pytest.mark.parametrize("sense", [-1, 1])
 def test_a_silent_beam_looked_where_its_ring_and_column_look(sense):
     look, points = sweep(sense)
-    found, known = beam_directions(points, (points != 0).any(axis=2))
+    found, known = references.beam_directions(points, (points != 0).any(axis=2))
     assert known.all()
     np.testing.assert_allclose(found, look, atol=1e-6)
 
@@ -138,22 +107,22 @@ def test_a_silent_beam_looked_where_its_ring_and_column_look(sense):
 def test_a_ring_that_never_came_back_looks_nobody_knows_where():
     _, points = sweep()
     points[3] = 0.0
-    assert (~beam_directions(points, (points != 0).any(axis=2))[1]).nonzero()[0].tolist() == [3] * COLUMNS
+    assert (~references.beam_directions(points, (points != 0).any(axis=2))[1]).nonzero()[0].tolist() == [3] * COLUMNS
 
 
 def test_a_sweep_keeps_every_beam_in_the_order_of_time():
     look, points = sweep()
-    (scan,) = organised_scans(recording(points))
+    (scan,) = references.organised_scans(recording(points))
     reach = np.linalg.norm(scan.points, axis=1)
-    silent = reach > 0.5 * SILENT_RANGE
+    silent = reach > 0.5 * references.SILENT_RANGE
     assert len(reach) == RINGS * COLUMNS
     assert silent.sum() == (points == 0).all(axis=2).sum()
     assert (np.diff(scan.times) >= 0).all()
     expected = look.transpose(1, 0, 2).reshape(-1, 3)
-    np.testing.assert_allclose(scan.points[silent] / SILENT_RANGE, expected[silent], atol=1e-6)
+    np.testing.assert_allclose(scan.points[silent] / references.SILENT_RANGE, expected[silent], atol=1e-6)
 
 
 def test_only_rings_by_columns_count_as_organised():
     _, points = sweep()
-    assert is_organised(recording(points))
-    assert not is_organised(recording(points, height=1))
+    assert references.is_organised(recording(points))
+    assert not references.is_organised(recording(points, height=1))

@@ -8,17 +8,29 @@ import numpy as np
 import pytest
 import trimesh
 
-from benchmarks.fidelity.candidate import Candidate
+from benchmarks.fidelity.candidate import Candidate, load_candidate
 from benchmarks.fidelity.case import Case
+from benchmarks.fidelity.derive.scene import scene_model
 from benchmarks.fidelity.derive.surface import visible_mesh
 from benchmarks.fidelity.faults import KINDS, Fault, Site, put_in
 from benchmarks.fidelity.faults.kinds import MESHES, TRACK, load_controls, local_site
-from tests.benchmarks.fidelity import tube
-from tests.recorded import check, figures
+from subterra_jax.host.tunnelfile import read_fields
+from tests.benchmarks.fidelity import tube, tubescene
+from tests.benchmarks.fidelity.test_tubes import about, value_of
+from tests.recorded import arrays_of, check, figures
 
 VALUES = Path(__file__).with_name("faults.csv")
 
-NO_SCENE = [id for id in load_controls() if id not in ("N01", "N12", "N29", "N30", "N31", "N33")]
+IN_SCENE = ("N01", "N12", "N29", "N30", "N31")
+DOSES = [  # the bold ones, and the last of each kind
+    (id, dose) for id, one in load_controls().items() if id not in IN_SCENE
+    for dose, fault in one.faults.items()
+    if dose in one.bold or dose == [d for d, other in one.faults.items() if other.kind == fault.kind][-1]
+]  # fmt: skip
+LOCAL = {"missing": 0.5, "pockets": 0.4} | dict.fromkeys(
+    ("wall", "roof", "floor", "aside", "lift", "rails", "track", "along", "roll", "box", "gauge", "section", "width",
+     "sleepers"), 0.04
+)  # fmt: skip
 
 
 def contents(case: Case) -> dict[str, Any]:
@@ -32,9 +44,17 @@ def contents(case: Case) -> dict[str, Any]:
 
 
 def changes(before: Case, after: Case) -> dict[str, Any]:
-    """Contents of a case that differ from those of another."""
+    """What was added to the contents of a case; what is new where there is more or less of it."""
     old, new = contents(before), contents(after)
-    return {name: value for name, value in new.items() if list(figures(value)) != list(figures(old[name]))}
+    return {name: _apart(value, old[name]) for name, value in new.items()
+            if list(figures(value)) != list(figures(old[name]))}  # fmt: skip
+
+
+def _apart(new: Any, old: Any) -> Any:
+    if isinstance(new, dict):
+        return {name: _apart(value, old[name]) for name, value in new.items()}
+    alike = np.shape(new) == np.shape(old) and np.asarray(new).dtype.names is None
+    return np.asarray(new, float) - old if alike else new
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +63,9 @@ def base() -> Case:
 
 
 def corrupt(case: Case, control: str, dose: float, scratch: Path = Path("unused")) -> Case:
-    return put_in(Site(case, scratch=scratch, foreign=lambda: case.candidate), load_controls()[control].faults[dose])
+    other = tube.Tube(heading=1.0, bend=70.0)
+    site = Site(case, scratch=scratch, foreign=lambda: tube.candidate(other))
+    return put_in(site, load_controls()[control].faults[dose])
 
 
 def candidate(case: Case, control: str, dose: float) -> Candidate:
@@ -60,26 +82,63 @@ def test_the_table_has_36_controls_and_7_invariances_and_each_has_a_function() -
         assert control.falls or control.limit or "leak" in control.reason
 
 
-@pytest.mark.parametrize("control", NO_SCENE)
-def test_a_control_changes_something_and_leaves_the_base_alone(base: Case, control: str) -> None:
+@pytest.mark.parametrize(("control", "dose"), DOSES)
+def test_a_control_changes_something_and_leaves_the_base_alone(base: Case, control: str, dose: float) -> None:
     before = base.candidate.lining.vertices.copy(), base.candidate.solid.faces.copy(), base.hold.origin.copy()
-    corrupted = corrupt(base, control, load_controls()[control].bold[0])
+    corrupted = corrupt(base, control, dose)
     np.testing.assert_array_equal(before[0], base.candidate.lining.vertices)
     np.testing.assert_array_equal(before[1], base.candidate.solid.faces)
     np.testing.assert_array_equal(before[2], base.hold.origin)
     assert corrupted.candidate is not base.candidate or corrupted.hold is not base.hold
     assert not corrupted.cache
-    check(VALUES, control, changes(base, corrupted))
-    again = corrupt(base, control, load_controls()[control].bold[0])  # the same bytes
+    check(VALUES, f"{control} {list(load_controls()[control].faults).index(dose)}", changes(base, corrupted))
+    again = corrupt(base, control, dose)  # the same bytes
     np.testing.assert_array_equal(corrupted.candidate.lining.vertices, again.candidate.lining.vertices)
     np.testing.assert_array_equal(corrupted.hold.range, again.hold.range)
 
 
-@pytest.mark.parametrize(
-    "kind", ["wall", "roof", "floor", "aside", "lift", "rails", "track", "along", "roll", "box", "gauge"]
-)
+@pytest.mark.parametrize("kind", LOCAL)
 def test_a_local_fault_changes_what_it_changed(base: Case, kind: str) -> None:
-    check(VALUES, kind, changes(base, put_in(local_site(base), Fault(kind, 0.04, 6.0, 2.0, 0.5))))
+    site = local_site(base)
+    check(VALUES, kind, changes(site.case, put_in(site, Fault(kind, LOCAL[kind], 6.0, 2.0, 0.5))))
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> Case:
+    return Case(load_candidate(tubescene.write(tmp_path_factory.mktemp("scene") / "tube", tube.Tube(length=12.0))))
+
+
+SCENES = {  # control, and what holds of the scene that it leaves
+    "N01": {
+        "mj_frame_err": about(0, 1e-3),
+        "mj_ray_vs_mesh_mae": about(0, 1e-3),
+        "mj_wall_contact_err": about(0, 0.01),
+    },
+    "N12": {"mj_frame_err": about(0, 1.0), "mj_ray_leak_rate": about(0.0475, 0.005)},
+    "N29": {"mj_probe_free_frac": about(0), "mj_ray_vs_mesh_mae": about(0, 1e-3)},
+    "N30": {"mj_wall_contact_err": about(0.10, 0.01), "mj_probe_free_frac": about(1)},
+    "N31": {"mj_wall_contact_err": about(0, 0.01)},
+}
+
+
+@pytest.mark.parametrize("control", SCENES)
+def test_a_control_of_the_scene_changes_what_it_says(scene: Case, tmp_path: Path, control: str) -> None:
+    dose = load_controls()[control].bold[-1]
+    after = corrupt(scene, control, dose, tmp_path)
+    known = {id: (value_of(id, after), low, high) for id, (low, high) in SCENES[control].items()}
+    assert {id: one for id, one in known.items() if not one[1] <= one[0] <= one[2]} == {}
+    model, plan = arrays_of(scene_model(after)), read_fields(after.candidate.tunnel)
+    shown = {"lining": after.candidate.lining.vertices, "faces": after.candidate.lining.faces}
+    check(VALUES, f"{control} scene", {"model": model, "plan": plan, **shown})
+    if control == "N31":
+        apart = [plan["left_smooth"] - plan["right_smooth"], plan["left_pockets"] - plan["right_pockets"]]
+        before = read_fields(scene.candidate.tunnel)
+        wide = np.linalg.norm(before["left_smooth"] - before["right_smooth"], axis=1) + dose
+        np.testing.assert_allclose(np.linalg.norm(apart, axis=2), [wide, wide], atol=1e-3)
+
+
+def apart(rail: dict[str, np.ndarray]) -> np.ndarray:
+    return np.linalg.norm(rail["left"] - rail["right"], axis=1)
 
 
 def gaps(one: Candidate) -> np.ndarray:
@@ -97,13 +156,7 @@ RATIOS = (  # control, dose, what it changes, and by which factor to which relat
     ("N09", 10, lambda one: len(one.track.sleeper), 0.9, 0.05),
     ("N14", 1, lambda one: one.solid.volume, -1.0, 1e-6),
     ("N23", 0.66, lambda one: np.median(gaps(one)), 1.1, 4e-3),
-    (
-        "N24",
-        1.445,
-        lambda one: np.linalg.norm(one.track.rail["left"] - one.track.rail["right"], axis=1),
-        1.445 / 1.435,
-        1e-3,
-    ),
+    ("N24", 1.445, lambda one: apart(one.track.rail), 1.445 / 1.435, 1e-3),
 )
 
 
@@ -155,11 +208,16 @@ def test_sleepers_go_with_their_fastenings(base: Case) -> None:
     assert len(after.sleeper_mesh.faces) / len(before.sleeper_mesh.faces) == pytest.approx(fraction, abs=1e-9)
 
 
-def test_removed_pockets_leave_a_smooth_wall_of_less_volume(base: Case) -> None:
+def test_removed_pockets_leave_a_smooth_wall_of_less_volume_half_a_millimetre_deep(base: Case) -> None:
     corrupted, pocket = candidate(base, "N25", 100), base.candidate.bore.pocket
     taken = base.candidate.solid.volume - corrupted.solid.volume
     assert taken == pytest.approx(float((pocket["length"] * pocket["width"] * pocket["depth"]).sum()), rel=0.35)
     assert len(corrupted.bore.pocket) == 0
+    moved = np.linalg.norm(corrupted.lining.vertices - base.candidate.lining.vertices, axis=1) > 0.05
+    local = Site(base).line.local(corrupted.lining.vertices[moved])
+    left = np.hypot(local[:, 1], local[:, 2]) - tube.Tube().scale(local[:, 0]) * tube.Tube().section.radius(
+        np.arctan2(local[:, 2], local[:, 1]))  # fmt: skip
+    assert np.median(left) == pytest.approx(5e-4, abs=2e-4)
 
 
 def test_a_wall_cuts_the_air_in_two(base: Case) -> None:
@@ -193,7 +251,7 @@ def test_permuted_poses_keep_every_beam(base: Case) -> None:
 
 def test_a_foreign_tunnel_is_brought_to_our_mouth(base: Case) -> None:
     other = tube.candidate(tube.Tube(heading=1.0, bend=70.0))
-    corrupted = put_in(Site(base, foreign=lambda: other), load_controls()["N33"].faults[1.0])
+    corrupted = corrupt(base, "N33", 1.0)
     assert corrupted.truth.position[0] == pytest.approx(other.bore.position[0], abs=0.2)
     flat = corrupted.truth.tangent[0, :2] @ other.bore.tangent[0, :2]
     assert flat == pytest.approx(1.0, abs=2e-3)

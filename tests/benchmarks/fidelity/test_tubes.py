@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import partial
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -51,14 +52,8 @@ def row_of(line: str) -> tuple[Any, dict[str, Any], dict[str, Bounds]]:
 
 FLAT = Tube(length=12.0, bend=inf, grade=0.0, variation=0.0, depth=0.0, track=False)
 WITHOUT = {"failed": inf, "missing": -inf}
-TUBES = {
-    "FLAT": FLAT,
-    "LOW": replace(FLAT, width=2.4, height=1.3),
-    "BARE": BARE,
-    "PLAIN": PLAIN,
-    "SHORT": SHORT,
-    "DEFAULT": DEFAULT,
-}
+TUBES = {"SIX": Tube(length=6.0), "FLAT": FLAT, "LOW": replace(FLAT, width=2.4, height=1.3), "BARE": BARE,
+         "PLAIN": PLAIN, "SHORT": SHORT, "DEFAULT": DEFAULT}  # fmt: skip
 ROWS = Path(__file__).with_name("tubes.txt").read_text(encoding="utf-8").splitlines()
 KNOWN = [row_of(line) for line in ROWS if not line.startswith("#")]
 
@@ -67,7 +62,7 @@ KNOWN = [row_of(line) for line in ROWS if not line.startswith("#")]
     ("right", "changes", "known"), KNOWN, ids=[f"{next(iter(ids))[:3]}-{changes}" for _, changes, ids in KNOWN]
 )
 def test_a_tube_of_other_dimensions_has_the_values_that_follow(right, changes, known) -> None:
-    case = judged(**changes) if right == DEFAULT else against(right, **changes)
+    case = (judged if right == DEFAULT else partial(against, right))(**changes)
     values = {id: value_of(id, case) for id in known}
     assert {id: values[id] for id, (low, high) in known.items() if not low <= values[id] <= high} == {}
 

@@ -10,29 +10,9 @@ from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.faults import Fault, put_in
 from benchmarks.fidelity.faults.kinds import local_site, stated_faults
 from benchmarks.fidelity.registry import Value
-from benchmarks.fidelity.windows.deviation import (
-    COLUMNS,
-    FINE,
-    LEAST,
-    REACH,
-    TRACK,
-    Relief,
-    hold_frame,
-    hold_map,
-    parts_hit,
-    shift_by_window,
-)  # fmt: skip
-from benchmarks.fidelity.windows.judge import (
-    SENSORS,
-    Noticed,
-    Windows,
-    Worst,
-    dump_windows,
-    limits,
-    load_windows,
-    sensor_of,
-    worst_windows,
-)  # fmt: skip
+from benchmarks.fidelity.windows import deviation
+from benchmarks.fidelity.windows import judge as windows_of
+from benchmarks.fidelity.windows.judge import Noticed, Windows
 from tests.benchmarks.fidelity import tube
 
 LENGTH = 24.0
@@ -44,15 +24,15 @@ def good() -> Case:
 
 
 @pytest.fixture(scope="module")
-def before(good) -> dict[str, Worst]:
+def before(good) -> dict[str, windows_of.Worst]:
     return by_name(good)
 
 
-def by_name(case: Case) -> dict[str, Worst]:
-    return {f"{one.id}.{one.source}": one for one in worst_windows(case)}
+def by_name(case: Case) -> dict[str, windows_of.Worst]:
+    return {f"{one.id}.{one.source}": one for one in windows_of.worst_windows(case)}
 
 
-def with_fault(good: Case, fault: Fault) -> dict[str, Worst]:
+def with_fault(good: Case, fault: Fault) -> dict[str, windows_of.Worst]:
     return by_name(put_in(local_site(good), fault))
 
 
@@ -89,25 +69,25 @@ def test_what_moves_along_the_tunnel_or_stands_apart_is_measured(good) -> None:
 
 def test_a_relief_is_found_where_it_was_moved_to_and_points_beyond_its_ends_count_for_nothing() -> None:
     rng = np.random.default_rng(3)
-    station = np.arange(0.025, 40.0, FINE)
-    blocks = np.repeat(np.repeat(rng.normal(0.0, 0.03, (80, COLUMNS // 6)), 10, 0), 6, 1)
-    judged = Relief(station, 2.5 + blocks)
+    station = np.arange(0.025, 40.0, deviation.FINE)
+    blocks = np.repeat(np.repeat(rng.normal(0.0, 0.03, (80, deviation.COLUMNS // 6)), 10, 0), 6, 1)
+    judged = deviation.Relief(station, 2.5 + blocks)
     judged.radius[rng.random(judged.radius.shape) < 0.02] = np.nan
     at, angle = rng.uniform(-2.0, 42.0, 60_000), rng.uniform(-np.pi, np.pi, 60_000)
     starts = np.array([-1.5, 0.0, 12.0, 31.0, 60.0])
 
     def found(shift: float) -> np.ndarray:
-        row = np.clip(((at + shift) / FINE).astype(int), 0, len(station) - 1)
-        seen = 2.6 + blocks[row, ((angle + np.pi) / (2.0 * np.pi) * COLUMNS).astype(int) % COLUMNS]
-        return shift_by_window(at, angle, seen + 0.004 * at, judged, starts, 10.0)
+        row = np.clip(((at + shift) / deviation.FINE).astype(int), 0, len(station) - 1)
+        seen = 2.6 + blocks[row, ((angle + np.pi) / (2.0 * np.pi) * deviation.COLUMNS).astype(int) % deviation.COLUMNS]
+        return deviation.shift_by_window(at, angle, seen + 0.004 * at, judged, starts, 10.0)
 
     for shift in (-0.35, 0.0, 0.1, 0.12, 0.35):
         within = 0.006 if shift == 0.12 else 0.004  # that of between two rays
         np.testing.assert_allclose(found(shift)[:4], shift, atol=within)
         assert np.isnan(found(shift)[4])  # no points there
-    assert np.isnan(found(REACH + 0.1)).all()
-    smooth = Relief(station, np.full((len(station), COLUMNS), 2.5))
-    assert np.isnan(shift_by_window(at, angle, np.full(len(at), 2.5), smooth, starts, 10.0)).all()
+    assert np.isnan(found(deviation.REACH + 0.1)).all()
+    smooth = deviation.Relief(station, np.full((len(station), deviation.COLUMNS), 2.5))
+    assert np.isnan(deviation.shift_by_window(at, angle, np.full(len(at), 2.5), smooth, starts, 10.0)).all()
 
 
 def test_a_wall_far_out_counts_as_half_a_metre(good) -> None:
@@ -128,13 +108,17 @@ def test_filled_pockets_lost_sleepers_and_a_cube_are_noticed(good) -> None:
 
 def test_a_cell_that_shows_mostly_track_says_nothing_of_the_bore(good) -> None:
     case = put_in(local_site(good), Fault("track", 0.008))
-    frame, one, on_track = hold_frame(case), hold_map(case), np.isin(parts_hit(case), TRACK)
+    frame, one, on_track = (
+        deviation.hold_frame(case),
+        deviation.hold_map(case),
+        np.isin(deviation.parts_hit(case), deviation.TRACK),
+    )
     cells = one.offset.size
     total, track = (np.bincount(frame.cell[rows & (frame.cell >= 0)], minlength=cells) for rows in (True, on_track))
     mostly = track > 0.5 * total
-    assert (mostly & (total - track >= LEAST)).any()  # beams that miss the track by a hair
+    assert (mostly & (total - track >= deviation.LEAST)).any()  # beams that miss the track by a hair
     assert np.isnan(one.offset.ravel()[mostly]).all()
-    assert np.isfinite(one.offset.ravel()[(track == 0) & (total >= 4 * LEAST)]).mean() > 0.95
+    assert np.isfinite(one.offset.ravel()[(track == 0) & (total >= 4 * deviation.LEAST)]).mean() > 0.95
 
 
 def test_a_mirrored_tube_fails_where_its_sides_differ_and_a_symmetric_one_cannot_tell(good, before) -> None:
@@ -161,14 +145,16 @@ def test_a_fault_leaves_the_rest_of_the_tunnel_exactly_alone(good) -> None:
 
 def test_windows_and_faults_that_go_unnoticed_decide_the_verdict() -> None:
     fine = {"base": {}, "null": {}}
-    worst = Worst("wall", "mean distance of the walls", "truth", "m", 0.07, 0.02, 12.0, 17.0, "", 1.0)
+    worst = windows_of.Worst("wall", "mean distance of the walls", "truth", "m", 0.07, 0.02, 12.0, 17.0, "", 1.0)
     missed = Windows((), (Noticed("roof 8 cm too low", ()),))
     other = Windows((replace(worst, value=0.01),), (Noticed("gauge 6 mm too wide", (), needed=False),))
     assert other.reasons() == []
     assert "would not notice" in missed.reasons()[0]
     reason = Windows((worst,)).reasons()[0]
     assert "7.0 cm from station 12 to 17 m" in reason
-    assert load_windows(dump_windows(Windows((worst,), missed.noticed))) == Windows((worst,), missed.noticed)
+    assert windows_of.load_windows(windows_of.dump_windows(Windows((worst,), missed.noticed))) == Windows(
+        (worst,), missed.noticed
+    )
     values = {id: Value(None, reason="none") for id in judge.table.load()}
     judged = judge.make_judgement(dict.fromkeys(fine, values), [], windows=Windows((worst,)))
     assert reason in judged.reasons
@@ -177,10 +163,10 @@ def test_windows_and_faults_that_go_unnoticed_decide_the_verdict() -> None:
 
 def test_a_recording_is_judged_by_the_limits_of_its_own_sensor() -> None:
     topics = {"/ouster/points": "os1", "/livox/lidar": "avia", "/velodyne_points": "vlp16", "/rslidar": None}
-    assert {topic: sensor_of(topic) for topic in topics} == topics
-    for sensor in SENSORS:
-        assert {name: limit for name, limit in limits(sensor).items() if name.endswith("truth")} == {
-            name: limit for name, limit in limits().items() if name.endswith("truth")
+    assert {topic: windows_of.sensor_of(topic) for topic in topics} == topics
+    for sensor in windows_of.SENSORS:
+        assert {name: limit for name, limit in windows_of.limits(sensor).items() if name.endswith("truth")} == {
+            name: limit for name, limit in windows_of.limits().items() if name.endswith("truth")
         }
 
 

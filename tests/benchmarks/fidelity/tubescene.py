@@ -1,4 +1,4 @@
-"""A whole scene folder of a tube: MJCF with a ball as robot, meshes, bore, planar tunnel and manifest, by own code."""
+"""A whole scene folder of a tube: MJCF with a ball as robot, meshes, bore, plan and manifest; recording, truth."""
 
 import json
 from itertools import pairwise
@@ -8,9 +8,23 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from benchmarks.fidelity.references import TRUTH_SCHEMA, Truth
 from subterra_jax.host.tunnelfile import write_tunnel
-from tests.benchmarks.fidelity.tube import Tube, candidate
+from tests.benchmarks.fidelity.tube import Tube, candidate, hold
+from tests.scene.bags import write_bag, write_tum
 
+HEAD = """ply
+format binary_little_endian 1.0
+element vertex {vertices}
+property double x
+property double y
+property double z
+element face {faces}
+property list uchar int vertex_indices
+property uchar part
+end_header
+"""
+FACE = np.dtype([("count", "u1"), ("index", "<i4", 3), ("part", "u1")])
 LIDAR_HEIGHT = 0.7
 _PANEL = 3.0
 
@@ -50,6 +64,33 @@ def write(folder: Path, tube: Tube | None = None, panels_off: float = 0.0) -> Pa
     (folder / "manifest.json").write_text(json.dumps({**made.manifest, "count": count}))
     np.savez(folder / "bore.npz", **vars(made.bore))
     _plan(folder / "tunnel.npz", tube)
+    return folder
+
+
+def record(folder: Path, tube: Tube, **settings) -> tuple[Path, Path]:
+    """The tube's held-out beams as a bag of sweeps, and the poses of the sensor."""
+    beams, origin = hold(tube, **{"spacing": 1.05, **settings}), np.asarray(tube.origin)  # at 1 m not all are scored
+    scans, poses = [], []
+    for number in np.unique(beams.scan):
+        own = beams.scan == number
+        stamp = float(beams.time[own][0])
+        scans.append((stamp, beams.range[own, None] * beams.direction[own]))
+        poses += [[stamp + late, *(beams.origin[own][0] + origin), 0, 0, 0, 1] for late in (0.0, 0.1)]
+    return write_bag(folder / "held_out.bag", scans), write_tum(folder / "held_out.tum", np.array(poses))
+
+
+def write_truth(folder: Path, known: Truth) -> Path:
+    """A truth as the survey writes it."""
+    surface = known.surface
+    faces = np.zeros(len(surface.faces), FACE)
+    faces["count"], faces["index"], faces["part"] = 3, surface.faces, known.part
+    head = HEAD.format(vertices=len(surface.vertices), faces=len(faces)).encode()
+    (folder / "truth.ply").write_bytes(
+        head + (surface.vertices + known.origin).astype("<f8").tobytes() + faces.tobytes()
+    )
+    columns = {name: getattr(known, name).tolist() for name in ("station", "tangent", "width", "height")}
+    columns |= {"position": (known.position + known.origin).tolist(), "definitions": {"parts": list(known.parts)}}
+    (folder / "truth.json").write_text(json.dumps({"schema": TRUTH_SCHEMA, **columns, **known.furniture}))
     return folder
 
 
