@@ -314,7 +314,7 @@ def _heading(places: Sequence[np.ndarray], before: np.ndarray) -> np.ndarray:
     centred = at - at.mean(axis=0)
     along = np.arange(len(at)) - (len(at) - 1) / 2
     fitted = along @ centred / (along @ along)
-    fraction = min(len(at) / _HEADED, 1.0) * 0.5
+    fraction = len(at) / _HEADED * 0.5
     mixed = fraction * fitted / max(float(np.linalg.norm(fitted)), 1e-9) + (1 - fraction) * before
     return mixed / np.linalg.norm(mixed)
 

@@ -7,11 +7,13 @@ import pytest
 import trimesh
 from rich.console import Console
 
+from scene import cloud
 from scene.bore import POCKET, STATION_STEP, Bore
 from scene.build import build
 from scene.config import BuildConfig
 from scene.fitting.section import measure_extents
 from scene.geometry import N_ANGLES, axis_through, section_angles
+from scene.reading import las_e57, source, tables
 from scene.survey.config import SurveyConfig
 from scene.survey.simulate import simulate
 from scene.writing.folder import Reconstruction, write_geometry
@@ -92,6 +94,15 @@ def simulated(tmp_path_factory) -> Simulated:
     named = BuildConfig(provenance="simulated")
     found = build(survey / "survey.bag", scene, survey / "groundtruth.tum", named)
     return Simulated(survey, scene, found, json.loads((survey / "truth.json").read_text()))
+
+
+@pytest.fixture
+def small_blocks(monkeypatch):
+    """Blocks so small that a file of a few hundred points has several."""
+    for module in (source, tables, las_e57):
+        monkeypatch.setattr(module, "BATCH", 300)
+    monkeypatch.setattr(source, "_TEXT_BLOCK", 5000)
+    monkeypatch.setattr(cloud, "_MERGE_AT", 350)
 
 
 @pytest.fixture

@@ -106,16 +106,6 @@ def test_the_middle_of_the_bore_is_free_and_its_walls_stop_a_body(scene):
     assert distance < 2.83, f"the scout went through the wall; it touches {names}"
 
 
-@pytest.mark.slow
-def test_the_scene_loads_into_mjx_and_steps(scene):
-    import jax
-    from mujoco import mjx
-
-    model = mujoco.MjModel.from_xml_path(str(scene / "scene.xml"))
-    data = jax.jit(mjx.step)(mjx.put_model(model), mjx.make_data(model))
-    assert np.isfinite(np.asarray(data.qpos)).all()
-
-
 def test_a_failed_build_leaves_the_previous_scene_whole(scene, tmp_path, command):
     before = {path: path.stat().st_mtime_ns for path in scene.rglob("*")}
     bad = tmp_path / "bad.ply"

@@ -260,8 +260,3 @@ def test_a_corrupted_field_is_named(built, tmp_path, changed, says):
     assert len(built[1].station) == 98
     with pytest.raises(TunnelError, match=says):
         read_tunnel(corrupted(built[0], tmp_path / "spoiled.npz", **changed))
-
-
-def test_an_unknown_lining_is_named(built):
-    with pytest.raises(TunnelError, match="the shell has no lining 'rough'; it has smooth, pockets, furnished"):
-        rolled.raise_shell(built[1].shell, "rough")

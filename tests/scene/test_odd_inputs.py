@@ -62,7 +62,7 @@ def ptx(points, place, rows=50, matrix=None) -> str:
     return "\n".join([*head, *(f"{x:.4f} {y:.4f} {z:.4f} 0.5" for x, y, z in points)]) + "\n"
 
 
-def test_a_ptx_of_two_scans_is_read_in_one_frame_without_its_empty_directions(tmp_path):
+def test_a_ptx_of_two_scans_is_read_in_one_frame_without_its_empty_directions(tmp_path, small_blocks):
     turned = np.eye(4)
     turned[:2, :2] = [[0.0, 1.0], [-1.0, 0.0]]  # a row of coordinates times this: by 90° to the left
     first, second = XYZ.copy(), XYZ.copy()

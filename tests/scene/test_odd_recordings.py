@@ -35,7 +35,7 @@ def outcome(path, *arguments) -> str:
 
 
 ODD = {
-    "one scan": (lambda path: clouds(path, [5.0]), "only 1 scans hold 100 points"),
+    "one scan": (lambda path: clouds(path, [5.0], XYZ[:100]), "only 1 scans hold 100 points"),
     "no points": (lambda path: clouds(path, [5.0, 5.1, 5.2], nothing()), "holds no scan with a return in it"),
     "NaN": (lambda path: clouds(path, [5.0, 5.1], np.full((300, 3), np.nan)), "holds no scan with a return in it"),
     "all one time": (lambda path: clouds(path, [5.0] * 9), ""),

@@ -52,9 +52,11 @@ def test_returns_move_with_the_sensor_during_a_sweep(tmp_path):
     rows = still(99.9, 101.0)
     rows[:, 1] = 10.0 * (rows[:, 0] - 100.0)
     trajectory = load_tum(write_tum(tmp_path / "t.tum", rows))
-    with Recording(write_bag(tmp_path / "a.bag", [(100.0, points)])) as recording:
-        registered = register_scans(recording, trajectory, 0.01, Stages().start("", 1))
-    assert registered.uncovered == 0
+    with Recording(write_bag(tmp_path / "a.bag", [(98.0, points), (100.0, points)])) as recording:
+        registered = register_scans(recording, trajectory, 0.01, Stages().start("", 2), most_uncovered=0.5)
+        with pytest.raises(RecordingError, match=r"covers 99\.90 to"):
+            register_scans(recording, trajectory, 0.01, Stages().start("", 2))
+    assert registered.uncovered == 1
     cloud = registered.cloud
     np.testing.assert_allclose(cloud.points[:, 0] + cloud.origin[0], 10.0, atol=1e-4)
 

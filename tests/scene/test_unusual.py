@@ -174,6 +174,7 @@ def test_a_container_is_read_whole(tmp_path, name):
     if "never" not in name:
         assert len(scans) == 12
         assert {scan.points.tobytes() for scan in scans} == {points.tobytes() for _, points, _ in sweeps(12)}
+        np.testing.assert_allclose([scan.times for scan in scans], [SINCE] * 12, atol=2e-4)
     assert np.all(np.diff([scan.stamp for scan in scans]) > 0)
     assert sum(len(scan.points) for scan in scans) >= (25 if "never" in name else 12) * RAYS
 
@@ -218,13 +219,14 @@ CLOUD_FILES: dict[str, tuple[str, str | bytes]] = {
 
 
 @pytest.mark.parametrize("name", CLOUD_FILES)
-def test_a_cloud_of_another_program_is_read_where_it_lies(tmp_path, name):
+def test_a_cloud_of_another_program_is_read_where_it_lies(tmp_path, name, small_blocks):
     ending, content = CLOUD_FILES[name]
     (tmp_path / ending).write_bytes(content if isinstance(content, bytes) else content.encode())
     (tmp_path / "a.prj").write_text(WKT)
     cloud, facts = read_cloud(tmp_path / ending, 1e-3)
     found = np.round(cloud.points + cloud.origin, 3)
     np.testing.assert_allclose(found[np.lexsort(found.T)], XYZ[np.lexsort(XYZ.T)], atol=2e-3)
+    keep(facts)
     assert facts["crs"] == WKT  # of the file beside it
 
 
