@@ -227,9 +227,3 @@ def test_the_reference_says_what_the_docstrings_say(site: Path):
         "Let a policy drive",
     ):
         assert said in text
-
-
-def test_a_tag_that_fetches_is_recognised():
-    assert ELSEWHERE.search('<script src="https://unpkg.com/x.js"></script>')
-    assert ELSEWHERE.search('<link rel="stylesheet" href="//fonts.example/css">')
-    assert not ELSEWHERE.search('<a href="https://example.org">')

@@ -1,6 +1,5 @@
 """The page about extensions: its files, from outside the package, work wherever a task or a sensor is taken."""
 
-import json
 import re
 import sys
 from pathlib import Path
@@ -11,14 +10,13 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from subterra_jax import policies, tasks
+from subterra_jax import tasks
 from subterra_jax.baselines.registry import make_agent
 from subterra_jax.evaluation import evaluate, listed_episodes
 from subterra_jax.host import task_ids
 from subterra_jax.host.loading import load_file
 from subterra_jax.parts import Part
 from subterra_jax.rules import Start, StopAt, Traverse
-from tests.train.conftest import SMALL, call
 from train.config import TrainConfig
 from train.setup import make_learner
 from train.world import open_world
@@ -152,23 +150,6 @@ class Hurry(StopAt):
 
 st.register("Mine/Hurry-v1", Hurry(), horizon=300, parts=(*st.tasks.SLIPPING, Gyro()))
 """
-
-
-@pytest.mark.parametrize(
-    ("task", "term"), [(TASK, "reward_gap"), ("hurry.py:Mine/Hurry-v1", "reward_hurry")], ids=["task", "reward, sensor"]
-)
-def test_a_policy_is_trained_on_a_task_reward_and_sensor_from_outside(desk, task, term):
-    from train import __main__ as navigate
-
-    (desk / "hurry.py").write_text(HURRY)
-    few = ("--steps=8192", "--evaluation-episodes", "2", "--tunnel", "control")
-    assert call(navigate.main, "--task", task, *SMALL, *few, "--out", "run") == 0
-    assert json.loads((desk / "run" / "evaluation.json").read_text())["episodes"] == 2
-    lines = [json.loads(line) for line in (desk / "run" / "log.jsonl").read_text().splitlines()]
-    assert [line["step"] for line in lines] == [4096, 8192]
-    assert lines[-1][term] < 0.0
-    agent, _ = policies.load("run")
-    assert agent.layout.shape.n_inputs == 42  # of a plain task 41: the file's own number is read too
 
 
 def test_a_trainer_takes_a_task_reward_and_sensor_from_outside(desk):

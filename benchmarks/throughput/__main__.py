@@ -46,7 +46,7 @@ def run(config: ThroughputConfig) -> report.Result:
             raise BenchmarkError(f"--peers jaxnav takes one tunnel, and there are {count}")
         require_jaxnav()
     plans = [st.load_tunnel(name) for name in names[:_COMPARED]]
-    made: Any = tunnels.load(names, config.lining) if count > 1 else plans[0]
+    made: Any = tunnels.load(names, config.lining, config.sensor) if count > 1 else plans[0]
     lining = config.lining if count == 1 else None  # what is made already has its lining
     shown: Any = {} if config.texture is None else {"intensity": True, "texture": config.texture}
     copies = made * config.copies if count > 1 else made

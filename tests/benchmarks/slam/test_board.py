@@ -2,8 +2,10 @@
 
 import json
 import shutil
+import sys
 from itertools import islice
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,6 +20,9 @@ from benchmarks.slam.board_page import records_of
 from benchmarks.slam.score import reach_of
 from subterra_jax.evaluation.localisability import PLACES, fit_slopes
 from tests.benchmarks.slam.tracks import line, write_axis, write_tum
+from tests.recorded import check
+
+VALUES = Path(__file__).with_name("values.csv")
 
 
 def test_slopes_are_those_of_the_ranges_and_jumps_count_as_noise():
@@ -31,9 +36,10 @@ def test_slopes_are_those_of_the_ranges_and_jumps_count_as_noise():
 def test_the_dial_tells_more_the_rougher_the_walls(monkeypatch):
     monkeypatch.setattr(board, "_SWEEPS", 2)
     found = {}
-    for walls in ("smooth", "joints", "furnished"):
-        scene = draw_scene(Course("one", walls, distance=10.0), np.random.SeedSequence(2))
+    for walls, texture in (("smooth", 0.0), ("joints", 0.0), ("furnished", 0.0), ("sprayed", 1.0)):
+        scene = draw_scene(Course("one", walls, distance=10.0, texture=texture), np.random.SeedSequence(2))
         found[walls] = board.find_floor(scene)
+        check(VALUES, f"floor of {walls}", found[walls]._asdict(), rel=1e-3)
     assert found["smooth"].sweep > 3.0 * found["joints"].sweep
     assert found["joints"].sweep > 3.0 * found["furnished"].sweep
     one = found["joints"]
@@ -85,19 +91,6 @@ def test_a_board_has_medians_over_the_sets_and_names_failures(sets, tmp_path):
     assert (found["arena/floor/smooth"].value, found["arena/floor/smooth"].commit) == (0.01, "abc")
 
 
-def test_a_program_has_one_colour_and_marker_in_all_figures():
-    def styles(names: list[str]) -> dict[str, tuple]:
-        rows = [{"set": "one", "recording": "walls-smooth", "program": name, "drift": 1.0} for name in names]
-        floors = [{"recording": "walls-smooth", "drift": 0.01}]
-        handles, labels = board_page.draw_board({"rows": rows, "floors": floors}).axes[0].get_legend_handles_labels()
-        lines = dict(zip(labels, handles, strict=True))
-        return {name: (*lines[name][0].get_color(), lines[name][0].get_marker()) for name in names}
-
-    every = styles(list(programs.PROGRAMS))
-    assert len(set(every.values())) == len(every)
-    assert styles(["se3-lio", "rko-lio"]) == {name: every[name] for name in ("se3-lio", "rko-lio")}
-
-
 def test_half_a_trajectory_is_a_failure(sets, tmp_path):
     case = board.Case("mine", sets[0] / "recordings" / "walls-sprayed", tmp_path / "poses" / "one" / "mine")
     path = case.place / "walls-sprayed.tum"
@@ -143,6 +136,50 @@ def drive(tmp_path_factory) -> Path:
     (one / "calibration.yaml").write_text(yaml.safe_dump(record.calibration(scene)))
     record.write_truth(scene, folder / "truth" / "one")
     return folder
+
+
+def _numbers(value):
+    """All numbers of an argument; of times since 1970, s or ns, the last digits."""
+    if isinstance(value, dict | list | tuple):
+        rows = [_numbers(one) for one in (value.values() if isinstance(value, dict) else value)]
+        return np.concatenate([*rows, np.zeros(0)])
+    found = np.ravel(value).astype(float)
+    return np.where(found > 1e17, found % 1e12, np.where(found > 1e9, found % 1e3, found))
+
+
+@pytest.mark.parametrize("name", ["rko-lio", "se3-lio", "genz-lio", "pelorus"])
+def test_a_program_is_fed_sweeps_and_imu_samples_in_order(name, drive, tmp_path, monkeypatch, capsys):
+    calls, pose, stamps = {}, np.eye(4) + np.diag([0.25, 0.5], 2), iter(np.arange(1.5, 9.0))
+
+    def note(call, answer=lambda: None):
+        def called(*args, **options):
+            for k, value in enumerate([*args, *options.values()]):
+                calls.setdefault(f"{call} {k}", []).append(value)
+            return answer()
+
+        return called
+
+    turned = {"orientation": (0.5, 0.5, 0.5, -0.5), "position": (1.0, 2.0, 3.0), "timestamp_nanosec": 5e8}
+    answers = iter([None, *(turned | {"timestamp_sec": k} for k in (1, 2, 3))])
+    program = SimpleNamespace(
+        add_imu_measurement=note("sample"), pose=lambda: pose, lidar_pose=pose, add_imu=note("sample"),
+        register_frame=note("sweep", lambda: (SimpleNamespace(stamp=next(stamps), pose=pose), None)),
+        register_scan=note("sweep", lambda: SimpleNamespace(valid=True, timestamp=next(stamps))),
+        add_pointcloud=note("sweep"), try_recv=lambda: next(answers),
+    )  # fmt: skip
+    settings = SimpleNamespace(mapping=SimpleNamespace())
+    module = SimpleNamespace(
+        LIOConfig=note("config"), LIO=lambda _: program, SE3LIO=note("config", lambda: program), Handle=lambda: program,
+        Config=lambda: settings, GenZLIO=lambda _: program,
+    )  # fmt: skip
+    for one in ("rko_lio", "rko_lio.config", "rko_lio.lio", "se3_lio", "genz_lio", "pelorus"):
+        monkeypatch.setitem(sys.modules, one, module)
+    assert programs.main([name, str(drive / "recordings" / "one"), str(tmp_path / "poses.tum")]) == 0
+    ran = json.loads(capsys.readouterr().out)
+    assert ran["poses"] == 3
+    told = {call: _numbers([one for one in values if one is not None]) for call, values in calls.items()}
+    told |= {"settings": str(settings), "poses": _numbers(np.loadtxt(tmp_path / "poses.tum"))}
+    check(VALUES, f"program {name}", told)
 
 
 def test_a_recording_must_be_whole_before_a_program_runs_on_it(drive, tmp_path, capsys):
