@@ -122,17 +122,6 @@ def test_a_task_from_outside_works_with_gymnasium_and_stable_baselines(desk):
     assert vector.step(np.zeros((2, 2), np.float32))[1].shape == (2,)
 
 
-@pytest.mark.slow
-def test_board_and_recorder_take_a_task_from_outside(desk, capsys):
-    from benchmarks.board.__main__ import main as board
-    from subterra_jax.recorder.__main__ import main as recorder
-
-    words = ["--tasks", TASK, "--agents", "dead-reckoning", "--episodes", "2", "--out", "board"]
-    assert board([*words, "--splits", "--further", "subterra-351"]) == 0
-    assert "KeepLeft" in (desk / "board" / "board.md").read_text()
-    assert recorder(["--task", TASK, "--agent", "dead-reckoning", "--steps", "20", "--out", "episode"]) == 0
-
-
 HURRY = """
 import dataclasses
 import jax.numpy as jnp

@@ -16,7 +16,6 @@ from scene.build import build
 from scene.config import BuildConfig, ReconstructConfig
 from scene.fitting.lining import LiningConfig
 from scene.writing.track import TrackConfig
-from subterra_jax.parts import Noise
 from tests.scene.clouds import curved_d_bore
 from tests.shared import METRO, needs_metro
 
@@ -30,15 +29,9 @@ def scene(tmp_path_factory):
 
 
 def device_scans(plan: st.TunnelPlan, poses: reference.Poses, lining: str) -> np.ndarray:
-    """Observations of the environment, without noise, from each pose."""
-    env, params = st.make("Subterra/Traverse-v1", tunnel=plan, lining=lining)
-    _, state = env.reset(jax.random.key(0), params)
-
-    def scan(position, heading, station):
-        here = state.replace(position=position, heading=heading, station=station)
-        return env.observe(here, {"lidar": Noise(jnp.zeros(16))}, params)[:16]
-
-    return np.asarray(jax.jit(jax.vmap(scan))(poses.position, poses.heading, poses.station))
+    """Ranges of the environment's LiDAR, without noise, from each pose."""
+    params = st.make("Subterra/Traverse-v1", tunnel=plan, lining=lining)[1]
+    return reference.simulate(params.tunnel, poses, params.lidar)
 
 
 @pytest.mark.parametrize(("lining", "file"), [("pockets", "scene.xml"), ("furnished", "scene_furnished.xml")])

@@ -9,7 +9,7 @@ import shlex
 import numpy as np
 import pytest
 
-from benchmarks import records, report
+from benchmarks import records
 from benchmarks.command import BenchmarkError, run_module
 from benchmarks.records import Record, rendered
 from benchmarks.truth import compare, load_truth
@@ -137,8 +137,3 @@ def test_a_file_of_another_schema_is_refused(tmp_path):
     (tmp_path / "t.json").write_text(json.dumps({"schema": "x"}))
     with pytest.raises(ValueError, match="schema is x"):
         load_truth(tmp_path / "t.json")
-
-
-def test_a_figure_of_the_demo_s_report_is_scaled_to_its_unit():
-    for row in report._ROWS:
-        assert row.factor == {"cm": 100, "%": 100, "million": 1e-6}.get(row.unit, 1.0), row
