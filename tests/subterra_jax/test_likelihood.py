@@ -11,6 +11,7 @@ from subterra_jax.baselines import scanmodel
 from subterra_jax.baselines.scanmodel import ScanModel, TunnelPose
 from subterra_jax.baselines.wallmap import wall_map
 from subterra_jax.tunnel import at_station
+from tests.recorded import check, named
 from tests.subterra_jax import tunnels
 
 BEAMS = lidar.LidarParams()
@@ -79,6 +80,7 @@ def test_a_stack_holds_the_map_of_each_of_its_tunnels(plan):
     alone = [st.Tunnel.from_plan(plan, "pockets"), st.Tunnel.from_plan(plan.slice(20.0, 50.0), "smooth")]
     stack = st.stack(alone)
     walls = wall_map(stack)
+    check(__file__, "map", named(walls))
     station, left = jnp.linspace(0.5, 49.5, 40), jnp.arange(40) % 2 == 0
     for index, tunnel in enumerate(alone):
         mine = walls.pick(stack.pick(index))

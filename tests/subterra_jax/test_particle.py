@@ -79,6 +79,16 @@ def test_the_age_of_what_is_observed_shows_when_the_robot_sets_off():
     assert float(reckoning.unobserved_distance(memory, PERIOD)) == pytest.approx(0.4)
 
 
+def test_the_ceiling_knows_how_late_an_episode_is_by_its_severity():
+    params = st.make("Subterra/Faulted-v1", tunnel="control")[1]
+    before = reckoning.begin_reckoning(Observed(jnp.zeros(18), jnp.zeros(16), jnp.zeros(()), jnp.zeros(())))
+    for severity, late in ((0, 0), (2, 1), (4, 2)):
+        known = {"severity": severity, "fault_delay": 2.0 / float(params.faults.delay)}
+        now = reckoning.known_delay(before, params, known)
+        assert (int(now.delay), float(now.waiting)) == (late, 0.0)
+    assert reckoning.known_delay(before, params, None) is before
+
+
 def test_the_odometer_weighs_as_much_as_its_nominal_errors_allow():
     _, params = st.make("Subterra/StopAtShort-v1", tunnel="subterra-351")
     # Variances: odometer 0.02² + 0.01², plant 0.02² + 0.02².

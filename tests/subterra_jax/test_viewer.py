@@ -177,8 +177,13 @@ def test_the_tunnel_moves_past_the_robot_and_the_page_names_what_it_shows(centre
     names = {one.get("name") for _, one in content["messages"]}
     check(__file__, "page", {"sent": gathered(content["messages"])})
     assert {"/robot", "/beams", "/hits", "/world/goal", "/world/estimate", "/world/odometry/robot"} <= names
-    bare = straight(centreline, goal=np.nan, estimate=np.full((21, 2), np.nan))
+    box = np.array([[12.0, 1.0, 0.8, 0.6, 0.4, 0.3]])
+    bare = straight(centreline, goal=np.nan, estimate=np.full((21, 2), np.nan), boxes=box)
+    bare.trace.pose = np.tile(np.r_[3.0, 4.0, 1.5, 1.0, 0.0, 0.0, 0.0, standing_pose()[0]], (21, 10, 1))
+    bare.trace.pose[..., 0] += np.linspace(0.0, 4.0, 210).reshape(21, 10)
     write_page(tmp_path / "b.html", bare, [], 0.35, {})
+    sent = gathered(played(tmp_path / "b.html")[1]["messages"])
+    check(__file__, "walker", {"sent": {name: one for name, one in sent.items() if "robot" in name or "box" in name}})
     assert "estimate" not in played(tmp_path / "b.html")[0].rpartition("<div")[2]
 
 

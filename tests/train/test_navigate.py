@@ -28,7 +28,7 @@ from train import __main__ as navigate
 from train import checkpoint, curve, walk
 from train.__main__ import read_command
 from train.b2 import embodied
-from train.b2.walking import WalkConfig, WalkDriver, make_walk_config, score
+from train.b2.walking import WalkConfig, WalkDriver, make_walk_config, score, walker
 from train.config import ConfigError
 from train.driver import Policy
 from train.policies import write_tensors
@@ -205,6 +205,12 @@ def test_one_fall_of_four_is_a_quarter_and_what_comes_after_it_does_not_count():
     assert found["falls"] == 0.25
     assert found["velocity_error"] == pytest.approx(0.1)
     assert found["power"] == pytest.approx(300.0)
+
+
+def test_robots_walk_for_their_score_as_they_walked():
+    env, params = st.make("Subterra/B2Walk-v1", engine="mujoco")
+    found = walker(env, lambda obs: jnp.zeros((len(obs), 12)), 2, 6)(params)
+    check(__file__, "walker", found, 5e-3)
 
 
 def test_settings_that_make_no_sense_are_refused_before_anything_is_compiled(tmp_path):

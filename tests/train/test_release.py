@@ -178,11 +178,13 @@ def test_a_trained_policy_succeeds_without_its_exploration_noise(trained):
 
 
 def test_the_command_prints_one_line_of_json_and_nothing_else(trained, tunnel, capfd):
-    words = ("--policy", str(trained), "--task", TASK, "--tunnel", str(tunnel), "--episodes", "100", "--json")
-    assert call(evaluate.main, *words) == 0
+    words = ("--policy", str(trained), "--tunnel", str(tunnel), "--episodes", "100")
+    assert call(evaluate.main, *words, "--json") == 0
     (line,) = capfd.readouterr().out.splitlines()
     saved = json.loads((trained / "evaluation.json").read_text())
     assert json.loads(line) == {name: value for name, value in saved.items() if name != "schema"}
+    assert call(evaluate.main, *words) == 0
+    assert f"{saved['success']:g}" in capfd.readouterr().out
 
 
 def test_an_ablation_takes_away_what_it_names_and_nothing_else():

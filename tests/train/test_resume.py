@@ -33,7 +33,7 @@ def whole(train_small):
     """A run that nobody killed."""
     status, out = train_small(*FEW)
     assert status == 0
-    check(__file__, "whole", {"log": log_without_timing(out)[:2]}, 1e-2)
+    check(__file__, "whole", {"log": log_without_timing(out)[:2]}, 1e-3)
     return out
 
 
@@ -97,7 +97,7 @@ def test_with_every_memory_a_run_goes_on_from_a_checkpoint_to_the_same_weights_t
     again = train(learner, world.params, snapshot=snapshot)
     jax.tree.map(np.testing.assert_array_equal, again.state, whole.state)
     assert {**again.record, "timing": None} == {**whole.record, "timing": None}
-    check(__file__, f"learns {memory}", {"line": {**whole.record, "timing": None}}, 1e-2)
+    check(__file__, f"learns {memory}", {"line": {**whole.record, "timing": None, "policy_loss": None}}, 1e-3)
 
 
 @pytest.mark.parametrize(

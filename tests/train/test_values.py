@@ -12,6 +12,7 @@ from tests.subterra_jax import tunnels
 from tests.train.conftest import weights_of
 from train.config import TrainConfig
 from train.driver import Policy
+from train.drives import record_drives
 from train.policies import begin_with
 from train.rollout import begin, collect
 from train.setup import make_learner
@@ -46,6 +47,15 @@ def test_an_unroll_is_what_it_was(memory):
         return drive.kept, collect(env, driver, policy, params, drive, jax.random.PRNGKey(2), N_STEPS)
 
     check(TABLE, f"unroll {memory}", named(unroll(policy, params)), 1e-3)
+
+
+def test_drives_are_drawn_as_they_were(tmp_path):
+    """Places, speeds and the first steps of 64 robots, some of which start where the task does."""
+    plan = tunnels.write_tunnel(tmp_path / "straight.npz", tunnels.tunnel_arrays(tunnels.straight(120.0)))
+    learner, _, params = learner_of("StopAtShort", TrainConfig(memory="along", auxiliary=True, hidden=(8,)), plan)
+    policy = Policy(weights_of(learner.driver, 0))
+    run = jax.jit(lambda policy, params: record_drives(learner.driver, policy, params, jax.random.PRNGKey(3), 64, 4))
+    check(TABLE, "drives", named(run(policy, params)), 1e-3)
 
 
 def test_a_localiser_learns_what_it_learnt(tmp_path):

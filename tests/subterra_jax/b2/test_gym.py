@@ -90,6 +90,7 @@ def test_told_to_walk_it_walks_and_its_legs_know_how_far(env):
 
 
 def test_told_to_stand_it_stands_and_a_nan_is_a_zero(env):
+    assert env.metadata["render_fps"] == 5
     outcome = drive(env, (0.0, 0.0), 15)
     assert abs(outcome[-1][4]["station"] - outcome[9][4]["station"]) < 0.02  # once the feet are settled
     again = drive(env, (np.nan, np.nan), 15)
@@ -162,6 +163,7 @@ def test_gymnasium_knows_the_walking_task_by_its_id(plan):
     inner: Any = gymnasium.make("Subterra/B2Walk-v1", tunnel=plan).unwrapped
     assert (inner.action_space.shape, inner.observation_space.shape) == ((12,), (56,))
     assert inner.walk.physics.period == pytest.approx(0.02)
+    assert inner.metadata["render_fps"] == 50
     with pytest.raises(ResetNeeded):
         inner.step(np.zeros(12))
 
