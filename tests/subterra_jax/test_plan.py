@@ -97,6 +97,7 @@ def test_the_ring_pitch_is_read_and_is_0_in_a_file_without_it(plan_of, arrays):
     assert plan_of(arrays).slice(10.0, 20.0).ring_pitch == 1.5
     arrays.pop("ring_pitch")
     assert plan_of(arrays).ring_pitch == 0.0
+    assert plan_of(tunnels.tunnel_arrays(tunnels.straight(10.0), centre_step=10.0)).length == 10.0  # two stations do
     assert st.load_tunnel("subterra-351").ring_pitch == pytest.approx(1.5, abs=1e-3)
 
 
@@ -179,4 +180,5 @@ def test_a_bore_in_three_dimensions_is_read_and_refused_by_its_field(tmp_path, f
     np.savez(tmp_path / "bore.npz", **{**arrays, field: corrupt(arrays.get(field))})
     with pytest.raises(st.TunnelError, match=rf"bore\.npz.*{field}.*{refused}") if refused else nullcontext():
         shell = st.load_tunnel(tmp_path / "bore.npz").shell
+        np.testing.assert_allclose(np.linalg.norm(shell.tangent, axis=1), 1.0, atol=1e-9)
         assert shell.spacing == ((0.1, 0.12) if field == "shell_spacing" else (0.18, 0.2))

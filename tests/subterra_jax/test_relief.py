@@ -131,6 +131,7 @@ def test_a_surface_goes_to_the_device_as_it_did():
     spaces = {name: Space.from_plan(*make()) for name, make in BORES.items()}
     for name, space in (spaces | {"stack": Space.join(list(spaces.values()))}).items():
         check(TABLE, f"space {name}", told(space))
+    assert Space.join([spaces["upright"], None]) is None
 
 
 def as_set(faces: np.ndarray) -> set[tuple[int, ...]]:
