@@ -119,6 +119,10 @@ def test_a_box_in_the_way_slows_it_down_and_has_it_choose_another_lane(params):
     for far, leaves in ((3.7, False), (3.25, True)):  # m; a metre of free way is worth about one aside
         ranges[0] = far
         assert (abs(look(memory, observation(ranges=jnp.asarray(ranges)), jnp.zeros(2), params).lane) > 0.1) == leaves
+    back, was = avoid.turn_round(blocked), blocked
+    told = jnp.stack([back.along + was.along, back.across + was.across])
+    assert (jnp.nan_to_num(told) == 0.0).all()
+    assert (back.lane, back.corridor.left) == (-was.lane, was.corridor.right)
     steer = jax.jit(avoid.steer)
     assert steer(free, jnp.float32(2.0), params)[0] == pytest.approx(avoid.speed)
     near = dataclasses.replace(blocked, along=blocked.along - 1.3, lane=jnp.zeros(()))

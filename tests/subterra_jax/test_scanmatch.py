@@ -25,13 +25,11 @@ from subterra_jax.baselines.scanmatch import (
     centre,
     empty_profile,
     mismatch,
-    scan_matching,
     solve_adjustment,
 )
 from subterra_jax.baselines.scanmodel import TunnelPose
 from subterra_jax.baselines.stations import Driven
 from subterra_jax.baselines.wallmap import wall_map
-from subterra_jax.evaluation import evaluate, listed_episodes
 from tests.subterra_jax import tunnels
 
 BEAMS, PARAMS = lidar.LidarParams(), MatchParams()
@@ -129,15 +127,6 @@ def test_a_brightness_counts_by_its_own_spread_and_that_of_the_mean_it_meets(see
     cost = mismatch(profile, pose_at(N_BINS * BIN), ranges, PARAMS, jnp.full(16, 0.8))
     variance = PARAMS.face_sigma**2 * (1.0 + 1.0 / seen)
     np.testing.assert_allclose(cost, 16 * 3.0 * np.log1p(0.3**2 / (6.0 * variance)), rtol=1e-5)
-
-
-@pytest.mark.slow
-def test_scan_matching_beats_dead_reckoning_between_pockets():
-    env, params = st.make("Subterra/StopAt-v1")
-    episodes = listed_episodes(env, params, 50)
-    found = evaluate(env, params, scan_matching(params), episodes)
-    blind = evaluate(env, params, make_agent("fused", params), episodes)
-    assert found.success.mean() > blind.success.mean() + 0.1
 
 
 def test_of_a_lidar_in_three_dimensions_a_whole_level_ring_is_matched():

@@ -26,7 +26,7 @@ WAYS = {  # length of the tunnel (m), task, and what is not its own
     "Faults": (80.0, "Faulted", {**NEAR, "obstacles": ObstacleParams()}),
 }
 AGENTS = (
-    *(("Return", name, 200) for name in ("fused", "scan-matching", "Return-locate", "Return-v1")),
+    *(("Return", name, 200) for name in ("fused", "oracle", "scan-matching", "Return-locate", "Return-v1")),
     *(("Stop", name, 12) for name in ("histogram-filter", "StopAt-v1", "fused", "dead-reckoning")),
     *(("Hidden", name, 3) for name in ("ceiling", "particle-filter")),  # then rounding draws other particles
     ("Hidden", "locate-map", 150),

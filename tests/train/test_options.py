@@ -13,10 +13,12 @@ import pytest
 import subterra_jax as st
 from subterra_jax.host.versions import VERSION
 from subterra_jax.policies import load_policy
+from tests import recorded
 from tests.train.conftest import TASK, call, log_without_timing
 from train import __main__ as navigate
-from train import sinks, tunnels
+from train import evaluate, release, sinks, tunnels, walk
 from train.__main__ import read_command
+from train.b2.walking import make_walk_config
 from train.config import ConfigError, TrainConfig, check, make_config
 from train.devices import compiler_options
 from train.options import read_settings, reward_of, settings_of
@@ -24,6 +26,7 @@ from train.sinks import Logs
 from train.world import open_world, with_reward
 
 pytestmark = pytest.mark.door
+COMMANDS = (navigate.Command, evaluate.Command, release.Command, walk.Command)
 
 YAML = """
 task: Subterra/StopAtShort-v1
@@ -191,11 +194,17 @@ def test_a_setting_that_makes_no_sense_is_refused_by_name(name):
         check(dataclasses.replace(TrainConfig(), **{name: WRONG[name]}))
 
 
-@pytest.mark.parametrize("preset", ["cpu", "gpu"])
-@pytest.mark.parametrize("task", [id for id in st.TASKS])
-def test_every_task_has_presets_that_make_sense(task, preset):
-    config = check(make_config(task, preset))
-    assert preset == "cpu" or config.steps_per_iteration >= 50_000
+def test_every_task_has_presets_that_make_sense_and_are_what_they_were():
+    made = [check(make_config(task, preset)) for task in st.TASKS for preset in ("cpu", "gpu")]
+    assert min(one.steps_per_iteration for one in made[1::2]) >= 50_000
+    every = (
+        [*map(dataclasses.asdict, made)],
+        [dataclasses.asdict(make_walk_config(preset)) for preset in ("cpu", "gpu")],
+    )
+    recorded.check(__file__, "presets", dict(zip(("tasks", "walk"), every, strict=True)))
+    fields = {f"{one.__module__} {f.name}": f for one in COMMANDS for f in dataclasses.fields(one)}
+    usual = {name: str(f.default) for name, f in fields.items() if f.default is not dataclasses.MISSING}
+    recorded.check(__file__, "commands", {"usual": usual})
 
 
 def test_steps_are_rounded_up_to_whole_iterations():

@@ -164,6 +164,7 @@ def test_gymnasium_knows_the_walking_task_by_its_id(plan):
     assert (inner.action_space.shape, inner.observation_space.shape) == ((12,), (56,))
     assert inner.walk.physics.period == pytest.approx(0.02)
     assert inner.metadata["render_fps"] == 50
+    assert set(inner.action_space.high) == {1.0} == set(-inner.action_space.low)
     with pytest.raises(ResetNeeded):
         inner.step(np.zeros(12))
 
