@@ -91,7 +91,7 @@ def on_device(tunnel):
         "box": dict(enumerate(box[:, there])),
         "wall": np.asarray(tunnel.wall)[there],
         "padding": (np.flatnonzero(~there), box[:, ~there][[0, 1, 4, 6]]),
-        "packed": {"block": dict(enumerate(halves.T)), "wall": np.asarray(tunnel.packed.wall)},
+        "packed": {"block": dict(enumerate(halves.T[:13])), "wall": np.asarray(tunnel.packed.wall)},
     }
 
 
