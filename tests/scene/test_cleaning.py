@@ -180,6 +180,7 @@ def culvert(_rng: np.random.Generator) -> np.ndarray:
 def test_what_is_no_bore_is_refused_by_its_name(make, code):
     with pytest.raises(FitError) as raised:
         cleaned(make(np.random.default_rng(4)) + PLACE)
+    fits.keep(str(raised.value))
     assert raised.value.code in (code if isinstance(code, tuple) else (code,))
 
 

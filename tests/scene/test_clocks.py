@@ -45,7 +45,8 @@ def test_a_lag_is_found_whatever_the_mount(lidar, late):
         lambda at: turns_of_gyro(gyro(at, mount)),
         lambda at: turns_of_poses(Trajectory(AT + at, np.zeros((len(AT), 3)), attitude(AT) * mount, "poses")),
     ):
-        found, same = (find_lag(lidar, turns(at))[0] for at in (late, 0.0))
+        (found, agreement), (same, _) = (find_lag(lidar, turns(at)) for at in (late, 0.0))
+        assert 0.9 < agreement < 1.0
         assert found == pytest.approx(late, abs=0.6 * NOTICED)
         assert found - same == pytest.approx(late, abs=1e-3), "as precise between the lags that are tried"
 

@@ -11,7 +11,7 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from scene.bore import NAIL
-from scene.export import main
+from scene.export import main, read_parts
 from scene.writing.folder import write_geometry
 from scene.writing.mesh import build_solid
 from scene.writing.mjcf import SceneConfig
@@ -21,6 +21,7 @@ from subterra_jax.host.errors import TunnelError
 from subterra_jax.lidar3d import rolled, surface
 from subterra_jax.tunnel.sources import load_tunnel, read_tunnel
 from tests.scene.conftest import ORIGIN
+from tests.scene.fits import keep
 
 GROUPS = np.array([1, 1, 0, 0, 0, 0], np.uint8)
 N = 10_000  # rays
@@ -110,6 +111,25 @@ def test_rays_meet_the_export_where_they_meet_the_mjcf(scene, rays, tmp_path, to
     assert main([str(scene), "--to", to, "--out", str(out), "--licence", "CC0"]) == 0
     origins, headings, expected = rays
     agree(first_hits(load(out), origins, headings), expected)
+
+
+ROUND = """<mujoco><worldbody><geom name="post" type="cylinder" size="0.3 0.5"/>
+<geom name="pipe" type="capsule" size="0.3 0.5" pos="3 0 0"/></worldbody></mujoco>"""
+
+
+def test_round_things_are_as_large_as_they_are_and_plain_without_a_material(tmp_path):
+    (tmp_path / "scene.xml").write_text(ROUND)
+    (part,) = read_parts(tmp_path / "scene.xml")
+    assert (part.name, part.colour, part.roughness) == ("plain", (0.5, 0.5, 0.5, 1.0), 0.9)
+    for x, ends, high in ((0.0, 0.0, 0.5), (3.0, 4 / 3 * np.pi * 0.3**3, 0.8)):
+        faces = part.faces[np.abs(part.vertices[part.faces].mean(axis=1)[:, 0] - x) < 1]
+        solid = trimesh.Trimesh(part.vertices, faces)
+        assert solid.volume == pytest.approx(np.pi * 0.3**2 + ends, rel=0.03)
+        np.testing.assert_allclose(solid.bounds, [[x - 0.3, -0.3, -high], [x + 0.3, 0.3, high]], atol=1e-3)
+
+
+def test_materials_of_the_mjcf_are_those_of_the_export(scene):
+    keep([[part.name, part.colour, part.roughness, part.vertices] for part in read_parts(scene / "scene.xml")])
 
 
 @pytest.fixture(scope="module")

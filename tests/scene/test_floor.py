@@ -66,14 +66,12 @@ def test_floor_and_height_are_right_under_track_and_beside_walkways(world, senso
     assert np.median(bore.width) == pytest.approx(np.ptp(world.outline[:, 0]), abs=0.03)
 
 
-@pytest.mark.slow
-def test_sleepers_that_stand_out_little_do_not_lift_the_ballast(monkeypatch):
+def test_sleepers_that_stand_out_little_do_not_lift_the_ballast():
     low = [box for aside in (-2.0, 2.0) for box in railway.sleepers(SPACED, 0.06, aside)]
     world = World(arch(8.7, 6.6, 3.0), L, low)
-    points = SCANS["os1"](world)
-    assert abs(np.median(built(world, points, 0.04)[1][8:-8])) < 0.008
-    monkeypatch.setattr(floor, "_PEAK_HALF", 0.0)  # which leaves the line where it was
-    assert np.median(built(world, points, 0.04)[1][8:-8]) > 0.008
+    bore, error = built(world, SCANS["os1"](world), 0.04)
+    keep(bore)
+    assert abs(np.median(error[8:-8])) < 0.008
 
 
 def test_a_thin_cloud_shows_the_floor_between_sleepers_in_longer_windows():

@@ -1,8 +1,6 @@
 """A format that the package does not know, read by a module of the user's own."""
 
-import json
 import re
-import subprocess
 import sys
 import zipfile
 from pathlib import Path
@@ -17,8 +15,6 @@ from scene.reading import RawScan, ScanSource, formats, make_scan, register_read
 from scene.reading.formats import detect, load_reader
 from scene.reading.recording import Recording
 from subterra_jax.host.loading import UserCodeError, load_module
-from tests.scene.bags import write_tum
-from tests.scene.clouds import curved_d_bore
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "guide" / "extend.md"
@@ -60,21 +56,6 @@ def test_a_zip_of_ply_scans_is_read_by_a_file_outside_the_package(reader, tmp_pa
     assert facts["kind"] == "zip of PLY scans"
     assert facts["format_by"] == "name"
     assert "static" in facts["point_times"]
-
-
-@pytest.mark.slow
-def test_a_scene_is_built_from_it_by_one_option(reader, tmp_path):
-    bore = curved_d_bore(length=30.0, per_metre=4000, offset=(0.0, 0.0, 0.0))
-    walk = write_zip(tmp_path / "walk.zip", np.array_split(bore.points.astype(np.float32), 10))
-    poses = np.column_stack([START + np.array([-1.0, 2.0]), np.zeros((2, 6)), np.ones(2)])
-    words = [walk, "--reader", reader, "--trajectory", write_tum(tmp_path / "poses.tum", poses)]
-    command = [sys.executable, "-m", "scene.build", *map(str, words), "--out", str(tmp_path / "out")]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
-    assert manifest["detected"]["kind"] == "zip of PLY scans"
-    assert manifest["detected"]["scans"] == 10
-    assert manifest["bore"]["length"] == pytest.approx(30.0, abs=0.3)
 
 
 def test_a_damaged_scan_is_named(reader, tmp_path):

@@ -42,6 +42,14 @@ def test_a_cloud_without_point_times_is_a_static_sweep_and_says_so(tmp_path, ext
     assert not scan.times.any()
 
 
+def test_sweeps_without_times_and_headers_stand_at_the_time_of_recording(tmp_path):
+    raws = [(5.0 + k, pointcloud2(0.0, PLAIN, 12, columns())) for k in range(3)]
+    scans, facts = read(write_bag1(tmp_path / "a.bag", {"/points": raws}))
+    assert [scan.stamp for scan in scans] == [5.0, 6.0, 7.0]
+    assert "static" in facts["point_times"]
+    assert facts["point_times"].endswith("headers repeat, so the time of recording stands for them")
+
+
 def test_the_sensor_s_topic_is_preferred_and_the_others_are_named(tmp_path):
     messages = [(5.0 + k, pointcloud2(5.0 + k, PLAIN, 12, columns())) for k in range(3)]
     bag = write_bag1(tmp_path / "a.bag", {"/cloud_registered": messages, "/velodyne_points": messages[:1]})

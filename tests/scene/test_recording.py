@@ -1,11 +1,16 @@
 """Recordings come back as they were written: bags, and folders of scans."""
 
+from hashlib import sha256
+from io import StringIO
+
 import numpy as np
 import pytest
 import trimesh
 from pypcd4 import PointCloud
+from rich.console import Console
 
 from scene.errors import RecordingError
+from scene.inputs import hash_inputs
 from scene.poses.place import register_scans
 from scene.poses.trajectory import load_tum
 from scene.progress import Stages
@@ -18,6 +23,25 @@ SCANS = [(100.0 + 0.1 * k, np.arange(30.0).reshape(10, 3) + k) for k in range(5)
 def still(start: float, end: float) -> np.ndarray:
     times = np.arange(start, end, 0.05)
     return np.column_stack([times, np.zeros((len(times), 3)), np.tile([0.0, 0, 0, 1], (len(times), 1))])
+
+
+def test_a_long_stage_says_how_far_it_is_and_how_long_it_takes(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr("scene.progress.time.monotonic", lambda: now[0])
+    shown = Console(file=StringIO())
+    stage = Stages(shown).start("reading", 40)
+    stage.resume(4)
+    for now[0] in (109.0, 110.0, 119.0, 121.0):
+        stage.advance(4)  # a tenth; a line after 10 s at the earliest
+    assert shown.file.getvalue().splitlines() == ["reading: 30%, 0.8/s, 35 s left", "reading: 50%, 0.762/s, 26 s left"]
+
+
+def test_the_hash_of_a_folder_is_that_of_its_files_names_and_hashes(tmp_path):
+    write_bag(tmp_path / "a.bag", SCANS)
+    (tmp_path / "b.txt").write_text("b")
+    (record,) = hash_inputs([tmp_path], Stages())
+    hashes = [f"{file.name} {sha256(file.read_bytes()).hexdigest()}\n" for file in sorted(tmp_path.iterdir())]
+    assert (record["files"], record["sha256"]) == (2, sha256("".join(hashes).encode()).hexdigest())
 
 
 def test_scans_come_back_as_they_were_written(tmp_path):

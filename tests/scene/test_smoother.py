@@ -21,9 +21,8 @@ from scene.progress import Stages
 from scene.reading.recording import Recording
 from tests.recorded import check
 from tests.scene import walks
+from tests.scene.fits import TABLE, keep
 from tests.scene.surveyed import load_trajectory, survey
-
-TABLE = Path(__file__).with_name("values.csv")
 
 DURATION = 24.0
 
@@ -41,6 +40,7 @@ def test_prism_and_imu_give_place_and_attitude_however_the_imu_is_mounted(mounte
     )
     chain = solve_with_heading(problem, guess)
     twist, off = errors(chain, mounted)
+    keep({"twist": twist, "off": off, "bias": chain.accel_bias}, rel=1e-3)
     assert np.sqrt(np.mean(twist**2, axis=0)).max() < 0.3
     assert np.sqrt(np.mean(off**2)) < 0.003
     np.testing.assert_allclose(chain.gyro_bias[-1], 0.003, atol=1e-3)

@@ -12,6 +12,7 @@ from scene.poses.calibration import PRESETS, load_calibration
 from scene.poses.imu import imu_samples
 from scene.reading.recording import Recording
 from scene.survey import simulate
+from tests.scene.fits import keep
 from tests.scene.surveyed import Cast, Trajectory, load_cast, load_trajectory, read_tum, survey
 
 EPOCH = 1_700_000_000
@@ -100,6 +101,7 @@ def test_a_velodyne_sweep_is_stamped_at_its_end(folder: Path) -> None:
     assert np.unique(np.diff([t for t, _ in whole])).tolist() == [800_000_000]
     _, message = whole[12]
     points = records(message)[0]
+    keep(points, rel=1e-3)
     assert [f.name for f in message.fields] == ["x", "y", "z", "intensity", "ring", "time"]
     assert (message.height, message.point_step, message.header.frame_id) == (1, 22, "velodyne")
     end = message.header.stamp.sec - EPOCH + 1e-9 * message.header.stamp.nanosec
@@ -119,6 +121,7 @@ def test_a_velodyne_sweep_is_stamped_at_its_end(folder: Path) -> None:
 def test_an_ouster_sweep_has_a_row_for_each_ring_and_a_time_for_each_column(folder: Path) -> None:
     _, message = messages(folder / "survey_os1.bag", "/ouster/points")[12]
     points = records(message)
+    keep(points, rel=1e-3)
     names = ["x", "y", "z", "intensity", "t", "reflectivity", "ring", "ambient", "range"]
     assert [f.name for f in message.fields] == names
     assert (message.height, message.width, message.point_step) == (64, 1024, 48)

@@ -101,7 +101,6 @@ ROWS = {
     "an IMU 0.1 s late": Row(drive(imu_late=0.1), "the clock of the IMU /imu/data is 0.1", CONTROL, 2),
     "an IMU 0.1 s late, set right": Row(
         drive(imu_late=0.1), "", CONTROL + " --clock auto", facts=SOUND | {"clock_corrected": True}),
-    "an IMU 0.7 s late": Row(drive(imu_late=0.7), "the clock of the IMU /imu/data is 0.7", CONTROL, 2),
     "an IMU years late": Row(drive(imu_late=-2e8), "their clocks are -2e+08 s apart; --clock auto", CONTROL, 2),
     "a prism years late, set right": Row(
         drive(), "", CONTROL.replace("prism", "late") + " --clock auto",
