@@ -41,7 +41,8 @@ def _own(value: Any) -> Any:
 def told(result: Cleaned) -> dict[str, Any]:
     """What cleaning says of a cloud, and how many of its points have each cause."""
     count = {cause.name: int((result.cause == cause).sum()) for cause in Cause}
-    removed = [part.facts for part in result.removed]
+    names = ("start", "end", "points", "deepest")
+    removed = [{name: getattr(part, name) for name in names} for part in result.removed]
     return {"axis": result.axis.position, "behind": result.behind, "removed": removed, **count}
 
 

@@ -92,16 +92,10 @@ OTHER = "by another clock, {}; sweeps of 0."
 ROWS = {
     "ns since boot in floats": Row(boot("ns", 320.0), OTHER.format("ns"), facts=SOUND),
     "s since boot": Row(boot("s", 320.0), OTHER.format("s"), facts=SOUND | {"quaternions": "xyzw (by default)"}),
-    "s since boot, quaternions given": Row(
-        boot("s", 1500.0), OTHER.format("s"), "--trajectory {0}/vlp16.tum --quaternion xyzw",
-        facts=SOUND | {"quaternions": "xyzw (by flag)"}),
     "times that underflow": Row(
         drive(point_times="header", point_unit="ns", point_type="u4", bad_times=0.001),
         "points without a time of their sweep", facts=SOUND),
     "an IMU 0.1 s late": Row(drive(imu_late=0.1), "the clock of the IMU /imu/data is 0.1", CONTROL, 2),
-    "an IMU 0.1 s late, set right": Row(
-        drive(imu_late=0.1), "", CONTROL + " --clock auto", facts=SOUND | {"clock_corrected": True}),
-    "an IMU years late": Row(drive(imu_late=-2e8), "their clocks are -2e+08 s apart; --clock auto", CONTROL, 2),
     "a prism years late, set right": Row(
         drive(), "", CONTROL.replace("prism", "late") + " --clock auto",
         facts=SOUND | {"control_clock_offset": pytest.approx(2e8, abs=0.02), "control_clock_corrected": True}),
@@ -150,5 +144,5 @@ def test_a_row_of_the_table_ends_as_it_should(name, request, tmp_path, monkeypat
         assert line.startswith("error: ")
     else:
         manifest = json.loads((out / "manifest.json").read_text())
-        keep({part: manifest[part] for part in ("detected", "judgement", "count", "bore", "provenance")})
+        keep({part: manifest[part] for part in ("detected", "judgement")})
         assert row.facts.items() <= manifest["detected"].items()

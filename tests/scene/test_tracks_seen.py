@@ -87,7 +87,6 @@ def test_proud_sleepers_and_the_gauge_are_found(name, sensor, gauge):
     assert line.sleepers.protrusion == pytest.approx(0.24 if name == "ballast" else 0.22, abs=0.015)
     assert f1(bore, cloud, line.sleepers.station) >= 0.9
     laid = lay_track(bore, TrackConfig(), SeenTrack((line,), True))
-    keep(laid, " laid")
     assert laid.lines[0].gauge == line.rails.gauge
     assert describe_track(laid, SeenTrack((line,), True))["gauge_seen"] == line.rails.gauge
 
@@ -99,7 +98,7 @@ def test_two_tracks_are_two_and_a_gauge_that_no_face_shows_is_not_seen():
     assert all(f1(bore, cloud, line.sleepers.station) >= 0.9 for line in seen.lines)
     laid = lay_track(bore, TrackConfig(), seen)
     facts = describe_track(laid, seen)
-    keep([seen, laid, facts])
+    keep([seen, facts])
     assert [line["gauge_seen"] for line in facts["lines"]] == [None, None]
     assert [line["gauge_from"] for line in facts["lines"]] == ["by standard"] * 2
     assert facts["gauge"] == 1.435

@@ -260,13 +260,6 @@ def test_a_track_beside_the_axis_is_as_near_to_a_wall_as_its_nearer_end(bore, as
     np.testing.assert_allclose(laid.clearance, 2.8 - 1.3 - 1.25, atol=0.02)
 
 
-def test_the_scene_file_names_every_sleeper_and_both_rails(arc_scene):
-    folder, _, count = arc_scene
-    text = (folder / "scene.xml").read_text()
-    assert text.count('name="sleeper_') == count["sleepers"] == 41
-    assert text.count('name="rail_left_') == text.count('name="rail_right_') > 0
-
-
 def test_each_sleeper_has_two_pads_and_four_clips_on_the_rails_feet():
     config = TrackConfig()
     parts = fastening_mesh(config).split(only_watertight=True)
