@@ -136,11 +136,6 @@ def test_an_unseen_wall_is_named_with_its_side_and_its_stations(bore):
     assert "left wall" in judgement.warnings[0].text
 
 
-def test_an_unseen_floor_is_named(bore):
-    judgement = judged_without(bore, lambda station, _, upward: (upward < -3.1) & (station > 8) & (station < 18))
-    assert "from 8 to 18 m hardly a return lies on the floor" in judgement.warnings[0].text
-
-
 def test_strays_do_not_count_as_having_seen_a_wall(bore):
     few = np.random.default_rng(2).random(60_000) < 0.002
     judgement = judged_without(bore, lambda station, *_: (station > 8) & ~few)

@@ -123,6 +123,8 @@ def test_a_calibration_file_says_where_prism_and_imu_are(tmp_path):
     np.testing.assert_array_equal(found.prism, [0, 0.1, 0.4])
     np.testing.assert_allclose(found.imu["/imu"].rotation @ [1.0, 0.0, 0.0], [0, -1, 0], atol=1e-12)
     assert found.name == "c.yaml"
+    bare = find_calibration(str(write(tmp_path / "d.yaml", "imu: {/imu: {shift: [0.0, 0.0, 0.1]}}")))
+    assert (bare.prism.tolist(), bare.imu["/imu"].origin.tolist()) == ([0.0, 0.0, 0.0], [0.0, 0.0, -0.1])
 
 
 @pytest.mark.parametrize(
