@@ -32,7 +32,6 @@ def test_every_kind_is_drawn_and_the_same_number_draws_the_same():
     for name, odds in recordings._ODDS.items():
         assert set(counts[name]) == set(map(str, odds)), name
     beside = Counter(f"{case.sensor} {case.beside}" for case in cases)
-    assert len(beside) == 4
     lates = [case.late for case in cases if case.late > -2.0]
     check(VALUES, "draws of conventions", {**counts, "beside": beside, "late": lates})
     assert {case.late for case in cases if case.late < -2.0} == {-2e8}

@@ -5,14 +5,16 @@ import importlib.util
 import json
 import re
 import shlex
+from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
-from benchmarks import records
+from benchmarks import records, report
 from benchmarks.command import BenchmarkError, run_module
 from benchmarks.records import Record, rendered
-from benchmarks.truth import compare, load_truth
+from benchmarks.truth import Truth, compare, load_truth
 from tests.test_docs import command_line  # noqa: F401 (a fixture)
 
 ONE = Record(
@@ -137,3 +139,33 @@ def test_a_file_of_another_schema_is_refused(tmp_path):
     (tmp_path / "t.json").write_text(json.dumps({"schema": "x"}))
     with pytest.raises(ValueError, match="schema is x"):
         load_truth(tmp_path / "t.json")
+
+
+def test_the_demos_report_scales_and_judges_figures_and_refers_to_nothing_outside_itself(tmp_path, monkeypatch):
+    station = np.arange(0.0, 20.5, 0.5)
+    bend = np.stack([station, 0.01 * station**2, 7.0 + 0.02 * station], axis=1)
+    judged = {"warnings": ["<a>"], "share": {"explained": 0.9876}, "returns": 2.5e6, "tolerance": 0.05}
+    manifest = {"judgement": judged | {"wall_seen": 0.7}, "frame": {"origin": [0.0, 0.0, 0.1]}}
+    for folder in ("training", "scene"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "film.webp").write_bytes(b"RIFF0000WEBPVP8 ")
+    (tmp_path / "training" / "curve.png").write_bytes(report.png_bytes(plt.figure(), 10))
+    (tmp_path / "scene" / "manifest.json").write_text(json.dumps(manifest))
+    np.savez(tmp_path / "scene" / "bore.npz", station=station, position=bend)
+    monkeypatch.setattr(report, "picture", lambda *_: np.zeros((4, 4, 3), np.uint8))
+    monkeypatch.setattr(report, "png_bytes", lambda figure, dpi: figures.append(figure) or b"")
+    figures = []
+    summary = {row.key: 0.9 for row in report._ROWS} | {"task": "A-v1", "stage_seconds": {"survey": 12.34}}
+    summary |= {"width_rmse": 0.0399, "height_rmse": 0.0401, "coverage_mean_100": 0.901, "train_steps": 9e5}
+    text = report.write_report(tmp_path, summary, Truth(station, bend, station, station)).read_text()
+    assert re.findall(r'src="data:image/(\w+)', text) == ["webp", "png", "png", "png"]
+    assert (text.count("src="), text.count("http")) == (4, 0)
+    rows = re.findall('<tr class="(met|missed)">(.*?)</tr>', text)
+    said = [" ".join([word, *re.findall(r"<td[^>]*>([^<]*)", row)]).rstrip() for word, row in rows]
+    said += [re.search(r"The builder's judge.*?<|The builder&#x27;s judge.*?<", text)[0]]
+    assert said == Path(__file__).with_name("report.txt").read_text().splitlines()
+    (true, built), (side, above) = (axes.lines for axes in figures[0].axes)
+    np.testing.assert_allclose(np.linalg.norm(true.get_xydata(), axis=1), np.linalg.norm(bend[:, :2], axis=1))
+    np.testing.assert_allclose(true.get_xydata()[-1, 1], 0.0, atol=1e-9)
+    np.testing.assert_allclose(built.get_xydata(), true.get_xydata())
+    np.testing.assert_allclose([side.get_ydata(), above.get_ydata() - 0.1], [0.02 * station] * 2, atol=1e-9)

@@ -175,8 +175,7 @@ def test_a_program_is_fed_sweeps_and_imu_samples_in_order(name, drive, tmp_path,
     for one in ("rko_lio", "rko_lio.config", "rko_lio.lio", "se3_lio", "genz_lio", "pelorus"):
         monkeypatch.setitem(sys.modules, one, module)
     assert programs.main([name, str(drive / "recordings" / "one"), str(tmp_path / "poses.tum")]) == 0
-    ran = json.loads(capsys.readouterr().out)
-    assert ran["poses"] == 3
+    assert json.loads(capsys.readouterr().out)["poses"] == 3
     told = {call: _numbers([one for one in values if one is not None]) for call, values in calls.items()}
     told |= {"settings": str(settings), "poses": _numbers(np.loadtxt(tmp_path / "poses.tum"))}
     check(VALUES, f"program {name}", told)
