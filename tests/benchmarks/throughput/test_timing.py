@@ -16,7 +16,7 @@ from benchmarks.results import environment_facts
 from benchmarks.throughput import __main__ as command
 from benchmarks.throughput import report, timing
 from benchmarks.throughput.config import ThroughputConfig
-from benchmarks.throughput.loops import Peer, environment_loop, jaxnav_loop, measure_jaxnav
+from benchmarks.throughput.loops import Peer, environment_loop, measure_jaxnav
 from benchmarks.throughput.report import Result
 from benchmarks.throughput.timing import Loop, Speed, Timing, digest, measure
 from tests.recorded import check, lines_of
@@ -77,14 +77,6 @@ def test_sizes_are_measured_once_each_and_stop_at_4096_on_a_cpu(monkeypatch):
     assert ThroughputConfig().sizes()[-1] == 262_144
 
 
-def test_a_peer_that_is_not_installed_is_left_out_with_its_reason(monkeypatch):
-    monkeypatch.setitem(sys.modules, "jaxmarl", None)
-    monkeypatch.setitem(sys.modules, "jaxmarl.environments.jaxnav.jaxnav_env", None)
-    peer = measure_jaxnav((1, 2), Timing(), lambda _: None)
-    assert peer.speeds == []
-    assert "jaxmarl" in peer.left_out["all"]
-
-
 def test_a_peer_that_breaks_is_left_out_with_its_reason():
     def broken(n_envs: int) -> Loop:
         raise RuntimeError("RESOURCE_EXHAUSTED: 1 TiB" if n_envs > 4 else "no such map")
@@ -92,16 +84,6 @@ def test_a_peer_that_breaks_is_left_out_with_its_reason():
     peer = measure_jaxnav((4, 8), Timing(), lambda _: None, broken)
     assert peer.left_out == {"4": "RuntimeError: no such map", "8": "out of memory"}
     assert peer.speeds == []
-
-
-def test_jaxnav_has_as_many_beams_as_ours_and_one_agent():
-    pytest.importorskip("jaxmarl")
-    loop = jaxnav_loop(3)
-    carry = jax.jit(loop.reset)(jax.random.key(0), loop.params)
-    (obs, _), rest, done = jax.jit(loop.step)(jax.random.key(1), carry, loop.params)
-    assert np.isfinite(float(rest))
-    assert 0.0 <= float(done) <= 1.0
-    assert {name: value.shape for name, value in obs.items()} == {"agent_0": (3, 16 + 5)}
 
 
 def speed(n_envs: int, *rates: float) -> Speed:
@@ -167,9 +149,12 @@ def test_a_run_measures_what_is_asked_for(words, name, tmp_path, monkeypatch, ca
     check(VALUES, f"throughput of {name}", told | {"records": lines_of(read_records(tmp_path / "records.json"))})
 
 
-def test_a_peer_that_was_asked_for_and_is_not_there_is_a_mistake(monkeypatch, capsys):
+def test_a_peer_that_is_not_installed_is_left_out_with_its_reason_and_a_mistake_to_ask_for(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "jaxmarl", None)
     monkeypatch.setitem(sys.modules, "jaxmarl.environments.jaxnav.jaxnav_env", None)
+    peer = measure_jaxnav((1, 2), Timing(), lambda _: None)
+    assert peer.speeds == []
+    assert "jaxmarl" in peer.left_out["all"]
     assert run_here(monkeypatch, "--peers", "jaxnav") == 2
     assert "peer 'jaxnav' cannot be imported" in capsys.readouterr().err
 
