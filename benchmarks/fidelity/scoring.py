@@ -84,11 +84,11 @@ def score_all(values: Values, rows: dict[str, Metric] | None = None) -> Scored:
 def _category_score(scores: list[Score]) -> float | None:
     """Return the mean of the scored metrics, capped where a gate fails; `None` where over 30 % of them are missing."""
     scored = [s for s in scores if s.metric.scored]
-    known = [s for s in scored if s.score is not None]
+    known = [(s.score, s.metric.role) for s in scored if s.score is not None]
     if len(known) < len(scored) * (1.0 - MOST_MISSING):
         return None
-    mean = float(np.mean([s.score or 0.0 for s in known]))
-    gates = [s.score or 0.0 for s in known if s.metric.role == "G"]
+    mean = float(np.mean([score for score, _ in known]))
+    gates = [score for score, role in known if role == "G"]
     return min(mean, GATE_FLOOR) if gates and min(gates) < GATE_FLOOR else mean
 
 

@@ -172,7 +172,7 @@ def odometry_drift(case: Case) -> float:
         start = env.begin(env.draw_reset(begin, (), params), params).odometry
         drawn = env.draw_step(go, (steps,), params)["odometry"].normal
         motion = jnp.array([speed, 0.0])
-        advance = odometer.advance_odometry
+        advance = partial(odometer.advance_odometry, backward=jnp.array(False))
         last = jax.lax.scan(lambda s, n: (advance(s, motion, interval, n, params.odometry), None), start, drawn)[0]
         return last.distance - steps * speed * period
 

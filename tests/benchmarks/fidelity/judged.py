@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache, partial
+from typing import Any
 
 import trimesh
 
@@ -78,3 +79,18 @@ def category(name: str, case: Case) -> float:
     """Mean score of the metrics of a category that have one."""
     known = [score for score in scores(name, case).values() if score is not None]
     return sum(known) / len(known)
+
+
+def kept(case: Case) -> dict[str, Any]:
+    """What was derived of a case so far, by the names of functions and arguments; numbers and tables of them alone."""
+    caches = [case.cache, *(one.cache for one in (case.hold, case.truth) if one is not None)]
+    known = {key: value for results in caches for key, value in results.items() if not _is_tool(value)}
+    return {".".join(map(_word, key)).replace("benchmarks.fidelity.", ""): value for key, value in known.items()}
+
+
+def _word(part: object) -> str:
+    return str(part) if isinstance(part, str | int | float) else type(part).__name__
+
+
+def _is_tool(value: object) -> bool:
+    return callable(value) or type(value).__name__ in ("Geoms", "Stepper")

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 import trimesh
 
+from benchmarks.fidelity import table
 from benchmarks.fidelity.candidate import load_candidate
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.categories import scene as scene_metrics
 from benchmarks.fidelity.derive.lining import judged_pockets
+from benchmarks.fidelity.windows.judge import worst_windows
 from tests.benchmarks.fidelity import tube, tubescene
 from tests.benchmarks.fidelity.judged import PLAIN, SHORT, against, measure, raw
 from tests.benchmarks.fidelity.tube import Tube
@@ -22,6 +24,15 @@ short = partial(against, SHORT)
 def test_every_pocket_of_a_true_copy_is_found_and_without_any_their_error_has_failed() -> None:
     assert len(judged_pockets(against(PLAIN))) == len(PLAIN.pockets)
     assert measure("lin_pocket_depth_bias", against(PLAIN, depth=0.0)).failed
+
+
+def test_where_the_truth_says_nothing_of_its_furniture_it_is_missing_and_nothing_breaks() -> None:
+    case = against(SHORT)
+    bare = replace(case, truth=replace(case.truth, furniture={}, cache={}), cache={})
+    found = {id: measure(id, bare) for id, row in table.load().items() if row.category in ("LIN", "TRK")}
+    assert [id for id, value in found.items() if value.failed] == []
+    assert found["trk_sleeper_count_rel_err"].value is found["lin_pocket_f1"].value is None
+    assert [one.error for one in worst_windows(bare) if one.error] == []
 
 
 def test_a_floor_with_steps_everywhere_has_another_95th_percentile() -> None:

@@ -48,6 +48,23 @@ def test_a_dropped_face_opens_the_solid_and_shows_as_a_rim():
     )
 
 
+def test_a_floor_wound_the_wrong_way_costs_its_part_of_the_area():
+    lining = good().candidate.lining
+    low = lining.face_normals[:, 2] > 0.9
+    case = corrupted(lining=remade(lining, np.where(low[:, None], lining.faces[:, ::-1], lining.faces)))
+    left = 1.0 - lining.area_faces[low].sum() / lining.area
+    assert measure("mesh_orientation_frac", case).value == pytest.approx(left, abs=0.01)
+
+
+def test_a_bore_cut_across_is_two_pieces_with_two_rims_more():
+    lining = good().candidate.lining
+    station = (lining.triangles_center - SHORT.point(2.0, 0.0, 0.0)) @ SHORT.frames(2.0)[1][0]
+    case = corrupted(lining=remade(lining, lining.faces[np.abs(station) > 0.3]))
+    parts = [lining.area_faces[side * station > 0.3].sum() for side in (-1, 1)]
+    assert measure("topo_floater_area", case).value == pytest.approx(parts[0] / sum(parts), rel=1e-6)
+    assert [measure(id, case).value for id in ("topo_body_count_err", "topo_mouth_err")] == [1, 2]
+
+
 def test_the_volume_is_that_of_the_sections_and_a_scaled_solid_is_off_by_its_cube():
     assert measure("mesh_volume_vs_sections", good()).value < 0.2
     solid = good().candidate.solid.copy()

@@ -1,6 +1,7 @@
 """PAR: the scene in MJX and the environment on its plan."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,8 +12,9 @@ from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.derive import planar
 from benchmarks.fidelity.derive.contact import contact_depths
 from tests.benchmarks.fidelity import tubescene
-from tests.benchmarks.fidelity.judged import measure
+from tests.benchmarks.fidelity.judged import kept, measure
 from tests.benchmarks.fidelity.tube import Tube, hold
+from tests.recorded import check
 
 SHORT = Tube(length=9.0, track=False, variation=0.0)
 
@@ -84,3 +86,14 @@ def test_drift_is_compared_with_the_recordings_own_odometry(good, tmp_path):
     np.savetxt(tmp_path / "odometry.tum", rows)
     case = replace(good, hold=heard, candidate=replace(good.candidate, folder=tmp_path))
     assert measure("env_odom_drift_ratio", case).value == pytest.approx(0.0, abs=0.15)
+
+
+def test_what_its_values_are_made_of_is_what_it_was(good):
+    ids = [
+        id
+        for id, row in table.load().items()
+        if row.category == "PAR" and id not in ("mjx_put_model", "env_odom_drift_ratio")
+    ]
+    values = {id: measure(id, good).value for id in ids}
+    derived = {name: value for name, value in kept(good).items() if "path_divergence" not in name}  # of rounding
+    check(Path(__file__).with_name("values.csv"), "par", {**derived, **values}, 1e-3)

@@ -17,7 +17,7 @@ from benchmarks.fidelity.derive import clouds, distances
 from benchmarks.fidelity.faults import Fault, Site, put_in
 from benchmarks.fidelity.windows.judge import worst_windows
 from tests.benchmarks.fidelity import tube, tubescene
-from tests.benchmarks.fidelity.judged import SHORT, measure
+from tests.benchmarks.fidelity.judged import SHORT, kept, measure
 from tests.recorded import check
 
 TABLE = Path(__file__).with_name("values.csv")
@@ -69,14 +69,7 @@ def test_no_m3c2_distance_depends_on_how_a_normal_is_rounded(monkeypatch: pytest
 def test_what_values_are_made_of_is_what_it_was(known: bool) -> None:
     """Kept results of all derivations, which a percentile may hide."""
     values(known)
-    case = corrupted(known)
-    kept = {**case.cache, **case.hold.cache, **(case.truth.cache if known else {})}
-    results = {".".join(map(_word, key)).replace("benchmarks.fidelity.", ""): one for key, one in kept.items()}
-    check(TABLE, "derived" if known else "derived heard", results, 1e-3)
-
-
-def _word(part: object) -> str:
-    return str(part) if isinstance(part, str | int | float) else type(part).__name__
+    check(TABLE, "derived" if known else "derived heard", kept(corrupted(known)), 1e-3)
 
 
 @pytest.mark.parametrize("length", [8.0, 14.0])
@@ -98,3 +91,4 @@ def test_every_value_of_a_scene_in_mujoco_is_what_it_was(tmp_path) -> None:
         if row.category == "SCN" and id not in ("mj_step_rate", "mj_version_match")
     ]
     check(TABLE, "scene", {id: round(measure(id, case).value, 5) for id in ids}, 1e-3)
+    check(TABLE, "derived scene", kept(case), 1e-3)

@@ -53,6 +53,20 @@ def test_a_good_reconstruction_passes_and_a_null_tube_beside_it_does_not() -> No
     assert judge.make_judgement(made, ["the builder read it"]).reasons == ["leak: the builder read it"]
 
 
+def test_what_just_meets_every_bound_of_the_verdict_passes_and_what_is_below_one_does_not() -> None:
+    scored = scoring.score_all(values(0.98))
+    bound = replace(scored, overall=90.0, categories=dict.fromkeys(scored.categories, 70.0))
+    null = replace(scored, overall=80.0)
+    assert scoring.reasons_against(bound, null, 0.3, [], [], []) == []
+    for low, other, skill, said in (
+        (replace(bound, overall=89.99), replace(null, overall=70.0), 0.3, "global 90.0 is below 90"),
+        (replace(bound, categories=bound.categories | {"CEN": 69.9}), null, 0.3, "category CEN is 69.9, below 70"),
+        (bound, replace(null, overall=80.1), 0.3, "only 9.9 points above the null tube; 10 are asked"),
+        (bound, null, 0.29, "median skill over the null tube is 0.29, below 0.3"),
+    ):  # fmt: skip
+        assert scoring.reasons_against(low, other, skill, [], [], []) == [said]
+
+
 def test_a_control_that_falls_as_asked_is_detected() -> None:
     (row,) = judge_outcomes([outcome("N24", 1.445, values(0.98, ("TRK",), 0.3))], base())
     assert row["detected"]
