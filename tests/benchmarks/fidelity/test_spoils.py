@@ -162,10 +162,6 @@ def test_removed_pockets_leave_a_smooth_wall_of_less_volume_half_a_millimetre_de
     assert np.median(left) == pytest.approx(5e-4, abs=2e-4)
 
 
-def test_a_wall_cuts_the_air_in_two(base: Case) -> None:
-    assert len(candidate(base, "N20", 2).solid.split(only_watertight=True)) == 2
-
-
 def test_what_a_control_counts_is_as_dense_in_a_long_tunnel() -> None:
     """The points that it must cost were set on 36 m; one wall in ten times that would count a tenth."""
     straight = {"bend": np.inf, "depth": 0.0, "track": False}
