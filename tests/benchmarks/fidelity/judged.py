@@ -82,10 +82,10 @@ def category(name: str, case: Case) -> float:
 
 
 def kept(case: Case) -> dict[str, Any]:
-    """What was derived of a case so far, by the names of functions and arguments; numbers and tables of them alone."""
+    """What was derived of a case so far, by the names of functions and arguments; no tool, and no metric's own clock."""
     caches = [case.cache, *(one.cache for one in (case.hold, case.truth) if one is not None)]
-    known = {key: value for results in caches for key, value in results.items() if not _is_tool(value)}
-    return {".".join(map(_word, key)).replace("benchmarks.fidelity.", ""): value for key, value in known.items()}
+    known = {".".join(map(_word, key)): one for results in caches for key, one in results.items() if not _is_tool(one)}
+    return {name.replace("benchmarks.fidelity.", ""): one for name, one in known.items() if ".categories." not in name}
 
 
 def _word(part: object) -> str:
