@@ -168,7 +168,7 @@ def test_the_user_may_want_none_or_the_standard_and_rings_show_none():
         assert track_provenance(standard, shown)["sleepers"] == "by standard"
 
 
-@pytest.mark.parametrize("name", ["road", pytest.param("double", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["road", "double"])
 def test_what_is_written_agrees_and_a_scene_without_track_loads(name, tmp_path):
     _, bore = scanned(name, "terrestrial")
     seen = seen_in(name, "terrestrial")
