@@ -113,6 +113,8 @@ def test_a_cloud_that_lies_along_z_is_turned_and_says_so():
     assert "y is taken as up" in frame.facts["axes"]
     np.testing.assert_allclose(frame.apply(along_z), np.column_stack([POINTS[:, 1], -POINTS[:, 0], POINTS[:, 2]]))
     assert choose_frame(along_z, None, None, "xyz").facts["axes"] == "xyz (by flag)"
+    for high in ((25.0, 25.0, 40.0), (4.0, 4.0, 25.0)):  # a hall and a shaft, which no tunnel on its side is
+        assert choose_frame(np.indices((2, 2, 2)).reshape(3, -1).T * high, None, None, None).axes == "xyz"
 
 
 @pytest.mark.parametrize(

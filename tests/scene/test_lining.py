@@ -88,6 +88,7 @@ def test_every_pocket_is_joined_to_the_next_of_its_joint(bore):
     assert (np.abs(second["station"] - first["station"] - 0.4) < 1e-9).all()
     np.testing.assert_allclose(first["angle"], second["angle"])
     assert np.abs((first["station"] + second["station"])[:, None] / 2 - bore.ring_station).min(axis=1).max() < 1e-9
+    assert pair_pockets(replace(bore, pocket=bore.pocket[:1])).shape == (0, 2)
 
 
 def test_empty_pockets_have_no_nails():

@@ -81,6 +81,7 @@ def test_the_function_drives_the_very_episode_that_the_evaluation_drives(name, w
     env, params = world
     policy, driver = load_policy(name, env, params), Driver(env, keep=keep_all)
     first = driver.begin(params, policy.agent, 5)
+    assert first.level == -1  # the episode draws its level itself
     _, kept = driver.go(params, policy.agent, first, 0, 12)
     memory = policy.initial_memory(first.agent_key)
     for k in range(12):

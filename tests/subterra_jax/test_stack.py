@@ -117,6 +117,7 @@ def test_a_stack_of_one_is_that_one_and_picks_itself(alone):
     assert stack(alone[:1]) is alone[0]
     assert alone[0].pick(0) is alone[0]
     assert (alone[0].count, stack(alone[:2]).count) == (1, 2)
+    assert stack([alone[0], dataclasses.replace(alone[1], reach=20.0)]).reach == 20.0
     assert stack([alone[0], dataclasses.replace(alone[1], packed=None)]).packed is None  # XLA casts there
 
 

@@ -119,9 +119,8 @@ def test_a_fault_of_a_file_is_a_control_and_a_ladder_beside_the_suite(tmp_path: 
     assert judge.undetected([row | {"detected": False} for row in rows]) == []
     outside.clear()
     assert list_jobs(("dent",)) == []
-    monkeypatch.setattr(
-        sys, "argv", ["fidelity", "faults", "--kinds", "dent", "--metrics", str(file), "--scene", "none"]
-    )
+    words = ["faults", "--kinds", "dent", "--scene", "none", "--metrics", str(file)]
+    monkeypatch.setattr(sys, "argv", ["fidelity", *words])
     assert main() == 2
     assert "none" in capsys.readouterr().err  # and not that the kind is unknown
 

@@ -41,7 +41,7 @@ def messages(config, trace):
     return found
 
 
-def test_the_episode_is_the_one_that_the_leaderboard_scores(config, trace):
+def test_the_episode_is_the_one_that_the_board_scores(config, trace):
     env, params = st.make(TASK)
     agent = make_agent(config.agent, params)
     record = evaluate(env, params, agent, listed_episodes(env, params, 2)).where(np.array([False, True]))
