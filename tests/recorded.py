@@ -104,7 +104,7 @@ def named(tree):
 
 
 def drawn(figure: Any) -> dict[str, Any]:
-    """What a figure says and where its lines, areas, bars and pictures lie in the units of its axes."""
+    """Words of a figure, and where its lines, areas, bars and pictures lie in the units of its axes."""
     found: dict[str, Any] = {"words": "; ".join(text.get_text() for text in figure.findobj(Text) if text.get_text())}
     for number, axes in enumerate(figure.axes):
         parts = [(one.get_transform(), one.get_path()) for one in (*axes.lines, *axes.patches)]

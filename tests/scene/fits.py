@@ -39,7 +39,7 @@ def _own(value: Any) -> Any:
 
 
 def told(result: Cleaned) -> dict[str, Any]:
-    """What cleaning says of a cloud, and how many of its points have each cause."""
+    """Facts that cleaning gives of a cloud, and how many of its points have each cause."""
     count = {cause.name: int((result.cause == cause).sum()) for cause in Cause}
     names = ("start", "end", "points", "deepest")
     removed = [{name: getattr(part, name) for name in names} for part in result.removed]

@@ -161,7 +161,7 @@ def test_the_imu_in_the_housing_of_a_lidar_levels_it(monkeypatch):
 
 @pytest.fixture(scope="module", params=[0.0, 0.3])
 def recorded(request, tmp_path_factory):
-    """How late the IMU's clock is, s, a walk through a bore, its folder, and its true poses."""
+    """Delay of the IMU's clock, s, a walk through a bore, its folder, and its true poses."""
     words = ("--length", 10.5, "--seed", 4, "--point-rate", 24000, "--speed", 3, "--imu-late", request.param)
     folder = survey(tmp_path_factory.mktemp("walk"), *words)
     with Recording(folder / "survey.bag") as bag:

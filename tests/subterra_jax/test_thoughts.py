@@ -1,4 +1,4 @@
-"""What agents say and remember on ways of which they do not choose the commands is what it was."""
+"""Actions and memories of agents on ways whose commands others chose: they are what they were."""
 
 from functools import cache
 from pathlib import Path

@@ -82,7 +82,7 @@ def category(name: str, case: Case) -> float:
 
 
 def kept(case: Case) -> dict[str, Any]:
-    """What was derived of a case so far, by the names of functions and arguments; no tools, no clocks of metrics."""
+    """Results derived of a case so far, by the names of functions and arguments; no tools, no clocks of metrics."""
     caches = [case.cache, *(one.cache for one in (case.hold, case.truth) if one is not None)]
     known = {".".join(map(_word, key)): one for results in caches for key, one in results.items() if not _is_tool(one)}
     return {name.replace("benchmarks.fidelity.", ""): one for name, one in known.items() if ".categories." not in name}

@@ -61,7 +61,7 @@ known = cache(values)
 
 
 def given(case: Case, row: Metric) -> Value:
-    """What each metric is given: the truth is the best, then the reconstruction, unless it was moved to one side."""
+    """Values given to metrics: the truth is the best, then the reconstruction, unless it was moved to one side."""
     aside = np.abs(case.candidate.lining.vertices[:5] - tube.candidate(OFF).lining.vertices[:5]).max() > 0.05
     if case.candidate.name == "tube":
         return known(0.98, ("CEN", "C2M", "F2D", "TRK") if aside else (), 0.3)[row.id]

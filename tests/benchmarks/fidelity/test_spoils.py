@@ -44,7 +44,7 @@ def contents(case: Case) -> dict[str, Any]:
 
 
 def changes(before: Case, after: Case) -> dict[str, Any]:
-    """What was added to the contents of a case; what is new where there is more or less of it."""
+    """Things added to the contents of a case; all that is new where there is more or less of it."""
     old, new = contents(before), contents(after)
     return {name: _apart(value, old[name]) for name, value in new.items()
             if list(figures(value)) != list(figures(old[name]))}  # fmt: skip
